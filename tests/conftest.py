@@ -30,8 +30,7 @@ def rng() -> np.random.Generator:
     return np.random.default_rng(20240)
 
 
-@pytest.fixture(params=["cpu", pytest.param("cuda:0", marks=pytest.mark.gpu)])
+@pytest.fixture(params=["cpu", *wp.get_cuda_devices()], ids=str)
 def device(request):
-    if request.param != "cpu" and not wp.is_cuda_available():
-        pytest.skip("no CUDA device")
-    return request.param
+    """Every device of this machine: the CPU, and the GPUs where there are any."""
+    return str(request.param)

@@ -61,10 +61,10 @@ def take(value, name: str, shape: tuple, dtype, kind: Kind) -> wp.array:
     elif _is_torch(value):
         array = wp.from_torch(value.detach().to(wp.dtype_to_torch(dtype)).contiguous())
     else:
-        data = np.asarray(value)
+        data, numpy_type = np.asarray(value), wp.dtype_to_numpy(dtype)
         if data.dtype.kind not in "fiub":
-            raise TypeError(f"{name} must hold numbers, got {data.dtype}; convert it to {wp.dtype_to_numpy(dtype).__name__}")
-        data = np.ascontiguousarray(data, dtype=wp.dtype_to_numpy(dtype))
+            raise TypeError(f"{name} must hold numbers, got {data.dtype}; convert it to {numpy_type.__name__}")
+        data = np.ascontiguousarray(data, dtype=numpy_type)
         array = wp.array(data, dtype=dtype, device=kind.device, copy=False)
     if array.device != kind.device:
         raise ValueError(f"{name} must be on {kind.device}, got {array.device}; move it there first")
@@ -82,8 +82,6 @@ def _scalar_view(array: wp.array) -> wp.array:
     if size == 1:
         return array
     array = array if array.is_contiguous else array.contiguous()
-    view = wp.array(
-        ptr=array.ptr, shape=(*array.shape, size), dtype=array.dtype._wp_scalar_type_, device=array.device
-    )
+    view = wp.array(ptr=array.ptr, shape=(*array.shape, size), dtype=array.dtype._wp_scalar_type_, device=array.device)
     view._ref = array  # the view borrows the memory
     return view

@@ -1,16 +1,17 @@
 """The one place that decides how a kernel meets the machine: compiler flags, lanes per thread, and all cores.
 
-Warp runs a CPU launch as one sequential loop over threads on one core, and does not vectorise across threads. So a hot
-kernel here is written as a *lane loop*: thread ``b`` owns the :func:`lanes` items of block ``b`` and loops over them with
-one-item code, which LLVM widens to the core's vector registers. On CUDA the same factory is called with one lane, and a
-block is one item. The kernel's first argument is always ``first: int``, the block that thread 0 owns, because
-:class:`Job` splits the blocks into chunks and lets every core claim the next one until none is left.
+Warp runs a CPU launch as one sequential loop over threads on one core, and does not vectorise across threads. So a
+hot kernel here is written as a *lane loop*: thread ``b`` owns the :func:`lanes` items of block ``b`` and loops over
+them with one-item code, which LLVM widens to the core's vector registers. On CUDA the same factory is called with one
+lane, and a block is one item. The kernel's first argument is always ``first: int``, the block that thread 0 owns,
+because :class:`Job` splits the blocks into chunks and lets every core claim the next one until none is left.
 
 Rules for kernels that are launched from here:
 
 - argument 0 is ``first: int``; if argument 1 is named ``slot: int`` it receives the index of the worker that runs the
   chunk, in ``range(worker_count())``, to address scratch memory that no other worker touches;
-- two blocks never write the same address, or they write the same value to it: CPU atomics are not atomic across workers;
+- two blocks never write the same address, or they write the same value to it: CPU atomics are not atomic across
+  workers;
 - no tile kernels (their shared memory is one static buffer per module).
 """
 
@@ -26,12 +27,12 @@ import warp as wp
 CPU_FLAGS = (
     "-march=native -mllvm=-inline-threshold=9000 -mllvm=-inline-cold-callsite-threshold=3000"
     " -mllvm=-slp-recursion-max-depth=4"
-    # What turns a lane loop into vector code: fused multiply-adds from Warp's separate mul and add, the widest registers,
-    # a stack aligned for spilled vectors, and alias checks that the vectoriser would otherwise decline to emit.
+    # What turns a lane loop into vector code: fused multiply-adds from Warp's separate mul and add, the widest
+    # registers, a stack aligned for spilled vectors, and alias checks that the vectoriser would decline to emit.
     " -mprefer-vector-width=512 -ffp-contract=fast -mframe-pointer=all -mstackrealign"
     " -mllvm=-runtime-memory-check-threshold=100000 -mllvm=-memory-check-merge-threshold=1000000"
 )
-"""Compiler flags of every kernel module. One string for the whole project: each distinct string costs a precompiled header."""
+"""Compiler flags of every kernel module: one string, because each distinct one costs a precompiled header."""
 
 CPU_LANES = 256
 """Items that one CPU thread owns. Larger than Warp's ``max_unroll``, so that the lane loop stays a loop for LLVM."""
@@ -66,14 +67,16 @@ _threads: int | None = None
 
 
 def worker_count() -> int:
-    """Return how many workers share a launch: ``NEUMAT_THREADS`` or :func:`set_worker_count`, else every core allowed."""
+    """Return how many workers share a launch: :func:`set_worker_count`, else ``NEUMAT_THREADS``, else every core."""
     if _threads is not None:
         return _threads
     text = os.environ.get("NEUMAT_THREADS")
     if text is None:
         return _cores()
     if not text.isdigit() or int(text) < 1:
-        raise ValueError(f"NEUMAT_THREADS must be a whole number of at least 1, got {text!r}; unset it to use all cores")
+        raise ValueError(
+            f"NEUMAT_THREADS must be a whole number of at least 1, got {text!r}; unset it to use all cores"
+        )
     return int(text)
 
 
@@ -146,7 +149,7 @@ class Job:
         inputs: Kernel arguments after ``first`` (and ``slot``); arrays are kept alive by the job.
         outputs: Further kernel arguments, as in ``wp.launch``.
         device: Warp device; defaults to the current one.
-        grain: Fewest blocks worth a chunk of their own. Waking a worker costs about 60 µs, so a chunk should take longer.
+        grain: Fewest blocks worth a chunk of their own: waking a worker costs about 60 µs, a chunk should take longer.
     """
 
     def __init__(self, kernel, count: int, inputs, outputs=(), *, device=None, grain: int = 4):
@@ -156,7 +159,9 @@ class Job:
         self._offset = 2 if self._has_slot else 1
         self._arguments = [*inputs, *outputs]
         self._commands: list = []
-        self._grow(1)  # compiles and loads the module on this thread: a worker would pay a precompiled header of its own
+        self._grow(
+            1
+        )  # compiles and loads the module on this thread: a worker would pay a precompiled header of its own
 
     def _grow(self, workers: int) -> None:
         while len(self._commands) < workers:  # a recorded launch is mutable, so each worker has its own

@@ -1,0 +1,25 @@
+"""The fitting side of every model. A model is a module; the registry imports it only when it is asked for.
+
+What :mod:`warp_neumat.training` relies on, of a module: ``DATA`` (kind of source), ``configure(source, options) -> config``,
+``build(config, seed) -> model``, ``from_asset(tensors, config) -> model``, ``DEFAULT_STEPS``; of a model (a ``torch.nn.Module``):
+``prepare(samples) -> batch``, ``predict(batch)``, ``stages()``, ``trainable(stage)``, ``begin``, ``enter``, ``event``,
+``to_asset()``, ``statistics()`` and ``evaluate(*inputs)``; :class:`warp_neumat.models.neubrdf.NeuBRDF` says what each does.
+"""
+
+import difflib
+import importlib
+
+REGISTRY = {"neubrdf": "warp_neumat.models.neubrdf"}
+"""Module of every model, by the name that ``neumat fit --model`` takes and assets carry as ``kind``."""
+
+
+def find(name: str):
+    """Return the module of model ``name``.
+
+    Raises:
+        ValueError: If there is no such model; names the nearest.
+    """
+    if name not in REGISTRY:
+        close = difflib.get_close_matches(name, REGISTRY, n=1, cutoff=0.0)[0]
+        raise ValueError(f"no model {name!r}; nearest: {close}; known: {', '.join(REGISTRY)}")
+    return importlib.import_module(REGISTRY[name])

@@ -1,0 +1,64 @@
+"""The picture, read bilinearly from the radiance texture (MobileVR §4.2, forward rendering).
+
+The atlas guarantees that the four texels around any point of a chart belong to that chart (``pipeline/atlas.py``), so a
+plain bilinear fetch never reads another chart.
+"""
+
+import warp as wp
+
+from warp_neumat.kernels import dispatch
+from warp_neumat.kernels.worklist import footprint
+
+wp.set_module_options(dispatch.module_options())
+
+
+@wp.kernel
+def gather_kernel(
+    first: int,
+    pixel_triangle: wp.array(dtype=wp.int32),
+    pixel_barycentric: wp.array(dtype=wp.float32),
+    pixel_count: int,
+    per_block: int,
+    corner_uv: wp.array(dtype=wp.float32),
+    radiance: wp.array(dtype=wp.float16),
+    width: int,
+    height: int,
+    background: wp.vec3,
+    # outputs
+    image: wp.array(dtype=wp.float32),
+):
+    b = first + wp.tid()
+    for i in range(b * per_block, wp.min((b + 1) * per_block, pixel_count)):
+        f = pixel_triangle[i]
+        if f >= 0:
+            x, y, u, v = footprint(
+                corner_uv, f, pixel_barycentric[2 * i], pixel_barycentric[2 * i + 1], width, height
+            )
+            at = 4 * (y * width + x)
+            below = at + 4 * width
+            for c in range(3):
+                top = (1.0 - u) * float(radiance[at + c]) + u * float(radiance[at + 4 + c])
+                bottom = (1.0 - u) * float(radiance[below + c]) + u * float(radiance[below + 4 + c])
+                image[3 * i + c] = (1.0 - v) * top + v * bottom
+        else:
+            for c in range(3):
+                image[3 * i + c] = background[c]
+
+
+@wp.kernel
+def resolve_kernel(
+    first: int,
+    pixel_triangle: wp.array(dtype=wp.int32),
+    pixel_count: int,
+    per_block: int,
+    radiance: wp.array(dtype=wp.float16),
+    background: wp.vec3,
+    # outputs
+    image: wp.array(dtype=wp.float32),
+):
+    """The picture from radiance that was shaded per pixel."""
+    b = first + wp.tid()
+    for i in range(b * per_block, wp.min((b + 1) * per_block, pixel_count)):
+        covered = pixel_triangle[i] >= 0
+        for c in range(3):
+            image[3 * i + c] = wp.where(covered, float(radiance[4 * i + c]), background[c])

@@ -1,0 +1,212 @@
+"""Shading of surface samples from a work list of 2×2 quads, under point lights (MobileVR §4.2).
+
+A *sample image* says which point of the mesh each of its texels stands for: a triangle id (−1 = none) and the weights of
+the triangle's second and third vertex. The atlas is one, the camera raster another, so texture-space and screen-space
+shading are the same kernel. A quad is named by its column and row in one word (:data:`QUAD_SHIFT`).
+
+A block holds the texels of 64 quads. Position, normal and the local ω_o are computed once per texel; each light adds its
+share for the lanes it reaches, and a light below a lane's horizon costs that lane nothing. Radiance leaves as float16,
+RGB and coverage, because the gather is bound by the bytes it reads.
+"""
+
+import functools
+
+import warp as wp
+
+from warp_neumat.kernels import dispatch
+from warp_neumat.kernels.frame import frame_tangent, safe_normalize, to_local
+
+QUAD_SHIFT = 16
+"""A quad's word is column | row << QUAD_SHIFT."""
+
+HORIZON = wp.constant(0.01)
+"""Least cos θ_o that is shaded [1]: interpolated normals may lean away from the viewer on a triangle that faces it."""
+
+WORDS = 29
+"""Float32 words of scratch per lane, beside the material's own."""
+
+
+@wp.struct
+class Surface:
+    """A sample image with the mesh and materials it refers to; flat device arrays."""
+
+    width: int
+    height: int
+    triangle: wp.array(dtype=wp.int32)
+    barycentric: wp.array(dtype=wp.float32)
+    texel_material: wp.array(dtype=wp.uint8)
+    faces: wp.array(dtype=wp.int32)
+    side: wp.array(dtype=wp.int8)
+    points: wp.array(dtype=wp.float32)
+    normals: wp.array(dtype=wp.float32)
+    tangents: wp.array(dtype=wp.float32)
+
+
+@wp.struct
+class Lights:
+    """Point lights: position [m] and radiant intensity [W/sr], both [count, 3], flat."""
+
+    count: int
+    position: wp.array(dtype=wp.float32)
+    intensity: wp.array(dtype=wp.float32)
+
+
+@wp.func
+def local_view(v: wp.vec3, t: wp.vec3, b: wp.vec3, n: wp.vec3) -> wp.vec3:
+    """Return unit ``v`` in the frame, raised to :data:`HORIZON` where it lies below."""
+    w = to_local(v, t, b, n)
+    z = wp.max(w[2], HORIZON)
+    rest = wp.sqrt(wp.max(1.0 - z * z, 0.0) / wp.max(w[0] * w[0] + w[1] * w[1], 1.0e-12))
+    low = w[2] < HORIZON
+    return wp.vec3(wp.where(low, w[0] * rest, w[0]), wp.where(low, w[1] * rest, w[1]), z)
+
+
+@functools.cache
+def make_shade_kernel(functions_of, layout, lanes: int):
+    """Return the shading kernel of one kind of material.
+
+    Args:
+        functions_of: ``functions(layout, lanes)`` of the material's kernel file.
+        layout: The material's compile-time layout.
+        lanes: Lanes of a block, a multiple of 4 on the CPU; 1 on CUDA, where a block is one texel.
+    """
+    evaluate = functions_of(layout, lanes)
+    view, light = evaluate.view, evaluate.light
+    L, OWN = lanes, layout.scratch(lanes)
+    FLOAT = wp.constant(wp.uint64(4))
+
+    @wp.kernel(module="unique", module_options=dispatch.module_options())
+    def shade_kernel(
+        first: int,
+        slot: int,
+        material: evaluate.Arguments,
+        material_id: int,
+        quads: wp.array(dtype=wp.int32),
+        quad_count: int,
+        surface: Surface,
+        lights: Lights,
+        eye: wp.vec3,
+        scratch: wp.array(dtype=wp.float32),
+        # outputs
+        radiance: wp.array(dtype=wp.float16),
+        evaluations: wp.array(dtype=wp.int32),
+    ):
+        b = first + wp.tid()
+        own = scratch.ptr + wp.uint64(slot) * wp.uint64(OWN + WORDS * L) * FLOAT
+        if wp.static(L == 1):
+            local = wp.zeros(shape=(OWN + WORDS,), dtype=wp.float32)
+            own = local.ptr
+        P = wp.array(ptr=own, shape=(3 * L,), dtype=wp.float32)
+        N = wp.array(ptr=own + wp.uint64(3 * L) * FLOAT, shape=(3 * L,), dtype=wp.float32)
+        T = wp.array(ptr=own + wp.uint64(6 * L) * FLOAT, shape=(4 * L,), dtype=wp.float32)
+        O = wp.array(ptr=own + wp.uint64(10 * L) * FLOAT, shape=(3 * L,), dtype=wp.float32)  # noqa: E741
+        I = wp.array(ptr=own + wp.uint64(13 * L) * FLOAT, shape=(3 * L,), dtype=wp.float32)  # noqa: E741
+        Y = wp.array(ptr=own + wp.uint64(16 * L) * FLOAT, shape=(3 * L,), dtype=wp.float32)
+        E = wp.array(ptr=own + wp.uint64(19 * L) * FLOAT, shape=(3 * L,), dtype=wp.float32)
+        R = wp.array(ptr=own + wp.uint64(22 * L) * FLOAT, shape=(3 * L,), dtype=wp.float32)
+        address = wp.array(ptr=own + wp.uint64(25 * L) * FLOAT, shape=(L,), dtype=wp.int32)
+        active = wp.array(ptr=own + wp.uint64(26 * L) * FLOAT, shape=(L,), dtype=wp.int32)
+        chosen = wp.array(ptr=own + wp.uint64(27 * L) * FLOAT, shape=(L,), dtype=wp.float32)
+        own = own + wp.uint64(WORDS * L) * FLOAT
+
+        # Which texels, and what they see of the mesh: gathers, so no vector code, and none is wanted.
+        for l in range(L):
+            item = b * L + l
+            word = quads[wp.min(item >> 2, quad_count - 1)]
+            x = 2 * (word & 0xFFFF) + (item & 1)
+            y = 2 * (word >> QUAD_SHIFT) + ((item >> 1) & 1)
+            at = wp.min(y, surface.height - 1) * surface.width + wp.min(x, surface.width - 1)
+            inside = (item >> 2) < quad_count and x < surface.width and y < surface.height
+            mine = inside and int(surface.texel_material[at]) == material_id + 1
+            address[l] = at
+            chosen[l] = wp.where(mine, 1.0, 0.0)
+            if mine:
+                f = wp.max(surface.triangle[at], 0)
+                b1 = surface.barycentric[2 * at]
+                b2 = surface.barycentric[2 * at + 1]
+                b0 = 1.0 - b1 - b2
+                i0 = surface.faces[3 * f]
+                i1 = surface.faces[3 * f + 1]
+                i2 = surface.faces[3 * f + 2]
+                sign = wp.where(surface.side[f] < wp.int8(0), -1.0, 1.0)
+                for c in range(3):
+                    P[c * L + l] = (
+                        b0 * surface.points[3 * i0 + c]
+                        + b1 * surface.points[3 * i1 + c]
+                        + b2 * surface.points[3 * i2 + c]
+                    )
+                    N[c * L + l] = sign * (
+                        b0 * surface.normals[3 * i0 + c]
+                        + b1 * surface.normals[3 * i1 + c]
+                        + b2 * surface.normals[3 * i2 + c]
+                    )
+                    T[c * L + l] = (
+                        b0 * surface.tangents[4 * i0 + c]
+                        + b1 * surface.tangents[4 * i1 + c]
+                        + b2 * surface.tangents[4 * i2 + c]
+                    )
+                T[3 * L + l] = sign * surface.tangents[4 * i0 + 3]
+            else:
+                for c in range(3):
+                    P[c * L + l] = 0.0
+                    N[c * L + l] = wp.where(c == 2, 1.0, 0.0)
+                    T[c * L + l] = wp.where(c == 0, 1.0, 0.0)
+                T[3 * L + l] = 1.0
+
+        for l in range(L):
+            n = safe_normalize(wp.vec3(N[l], N[L + l], N[2 * L + l]))
+            t = frame_tangent(n, wp.vec3(T[l], T[L + l], T[2 * L + l]))
+            s = wp.cross(n, t) * T[3 * L + l]
+            v = safe_normalize(eye - wp.vec3(P[l], P[L + l], P[2 * L + l]))
+            o = local_view(v, t, s, n)
+            N[l] = n[0]
+            N[L + l] = n[1]
+            N[2 * L + l] = n[2]
+            T[l] = t[0]
+            T[L + l] = t[1]
+            T[2 * L + l] = t[2]
+            O[l] = o[0]
+            O[L + l] = o[1]
+            O[2 * L + l] = o[2]
+        for l in range(3 * L):
+            R[l] = 0.0
+            Y[l] = 0.0
+
+        view(material, O, own)
+        total = int(0)
+        for j in range(lights.count):
+            source = wp.vec3(lights.position[3 * j], lights.position[3 * j + 1], lights.position[3 * j + 2])
+            power = wp.vec3(lights.intensity[3 * j], lights.intensity[3 * j + 1], lights.intensity[3 * j + 2])
+            for l in range(L):
+                n = wp.vec3(N[l], N[L + l], N[2 * L + l])
+                t = wp.vec3(T[l], T[L + l], T[2 * L + l])
+                s = wp.cross(n, t) * T[3 * L + l]
+                d = source - wp.vec3(P[l], P[L + l], P[2 * L + l])
+                w = to_local(safe_normalize(d), t, s, n)
+                # Inverse square; within a millionth of the unit of length the light is inside the surface.
+                e = chosen[l] * wp.max(w[2], 0.0) / wp.max(wp.dot(d, d), 1.0e-12)
+                I[l] = w[0]
+                I[L + l] = w[1]
+                I[2 * L + l] = wp.max(w[2], 0.0)
+                E[l] = e * power[0]
+                E[L + l] = e * power[1]
+                E[2 * L + l] = e * power[2]
+            lit = int(0)
+            for l in range(L):
+                if E[l] + E[L + l] + E[2 * L + l] > 0.0:
+                    active[lit] = l
+                    lit += 1
+            if lit > 0:
+                light(material, I, active, lit, own, Y)
+                for l in range(3 * L):
+                    R[l] = R[l] + E[l] * Y[l]
+            total += lit
+        for l in range(L):
+            if chosen[l] > 0.0:
+                at = 4 * address[l]
+                for c in range(3):
+                    radiance[at + c] = wp.float16(wp.min(R[c * L + l], 65504.0))
+                radiance[at + 3] = wp.float16(1.0)
+        evaluations[b] = total
+
+    return shade_kernel

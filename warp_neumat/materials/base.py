@@ -1,0 +1,74 @@
+"""What every material offers, and how an asset becomes one."""
+
+import abc
+import dataclasses
+import importlib
+from collections.abc import Callable, Hashable
+from pathlib import Path
+from typing import Any
+
+from warp_neumat.io.asset import read_asset
+
+KINDS = {"neubrdf": "warp_neumat.materials.neubrdf:NeuBRDF"}
+"""Where the class of each kind lives: a kind that a scene does not use is never imported, so never compiled."""
+
+
+class Material(abc.ABC):
+    """A fitted material on one device.
+
+    Frames, units and the cosine are those of docs/conventions.md: ω_i to the light, ω_o to the viewer, both unit, local,
+    z = shading normal; :meth:`eval` returns value × cosine.
+    """
+
+    kind: str
+    """Kind of the asset, as ``"neubrdf"``."""
+    name: str
+    """File name without suffix, for reports."""
+    header: dict
+    """The asset's JSON header: config, source, training facts, metrics."""
+    bytes: int
+    """Size of the asset's tensors in bytes, as stored."""
+
+    @abc.abstractmethod
+    def eval(self, uv, wi, wo):
+        """Return value × cos θ_i [1/sr] for pairs of directions, shape [n, 3], float32, of the kind of ``wi``.
+
+        Args:
+            uv: Texture coordinates, shape [n, 2]; ignored, and may be None, where a material does not vary in space.
+            wi: Directions to the light, shape [n, 3]; numpy, torch or Warp.
+            wo: Directions to the viewer, shape [n, 3].
+
+        Below-horizon pairs give 0; no input gives a NaN or a negative value.
+        """
+
+    @abc.abstractmethod
+    def shader(self) -> "Shader":
+        """Return what ``kernels.shade`` needs to evaluate this material inside its own loop."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Shader:
+    """How a shading kernel evaluates a material.
+
+    Attributes:
+        functions: ``functions(layout, lanes)`` gives the Warp functions ``view`` and ``light`` and the struct
+            ``Arguments`` for blocks of ``lanes`` lanes.
+        layout: Hashable compile-time layout with ``scratch(lanes)``, the float32 words a block needs.
+        arguments: Instance of ``Arguments``: the material's device arrays.
+    """
+
+    functions: Callable
+    layout: Hashable
+    arguments: Any
+
+
+def load(path, *, device=None) -> Material:
+    """Open the asset at ``path`` on ``device`` (default: Warp's current device).
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        FormatError: If it is not an asset that this release reads; the message names file, field and rule.
+    """
+    tensors, header = read_asset(path)
+    module, _, name = KINDS[header["kind"]].partition(":")
+    return getattr(importlib.import_module(module), name)(tensors, header, path=Path(path), device=device)

@@ -1,0 +1,243 @@
+"""Renders mesh sequences with fitted materials, shading in texture space and reusing it over frames (MobileVR §4.2).
+
+A frame passes the stages ``mesh`` (animation and upload), ``visibility`` (camera raster), ``mark`` (which texels the picture
+will read), ``list`` (compaction into 2×2 quads by material), ``shade``, and ``gather`` (the picture from the radiance
+texture). With interval N, every (N + 1)th frame starts a new epoch, in which all that is seen is shaded anew; the N
+frames after it only shade what they see and the epoch has not shaded yet, so what comes into view is never a hole.
+
+In screen space, the same shading kernel runs on the camera raster itself, every pixel of every frame: the reference.
+"""
+
+import dataclasses
+import time
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+import warp as wp
+
+from warp_neumat.kernels import dispatch, gather, worklist
+from warp_neumat.kernels.visibility import CameraRaster
+from warp_neumat.pipeline.atlas import Atlas
+from warp_neumat.pipeline.camera import CameraPath, load_camera
+from warp_neumat.pipeline.lights import PointLights, lights_from
+from warp_neumat.pipeline.sequence import MeshSequence
+from warp_neumat.pipeline.surface_mesh import SurfaceMesh, bind_materials
+from warp_neumat.pipeline.texel_shader import TexelShader
+
+SKIPS = ("unowned", "backfacing", "unseen")
+"""Texels that are not shaded: of no chart, of triangles that face away, and those the picture does not read."""
+
+_PIXELS = 4096  # per block of the per-pixel kernels
+
+
+@dataclasses.dataclass(frozen=True)
+class RenderedFrame:
+    """One picture and what it took.
+
+    Attributes:
+        index: Frame number in the sequence.
+        image: Linear Rec. 709 radiance, shape (H, W, 3), float32, row 0 on top. The renderer writes the next frame
+            into the same memory: copy what is to be kept.
+        stats: ``ms`` per stage, ``texels`` (owned, facing, seen, shaded), ``evaluations`` (material × light),
+            ``updated`` (whether the frame started a new epoch).
+    """
+
+    index: int
+    image: np.ndarray
+    stats: dict
+
+
+class _Clock:
+    """Adds up milliseconds per stage."""
+
+    def __init__(self, device):
+        self.ms, self._device, self._last = {}, device, time.perf_counter()
+
+    def stage(self, name: str) -> None:
+        """End the stage ``name``."""
+        if not self._device.is_cpu:
+            wp.synchronize_device(self._device)
+        now = time.perf_counter()
+        self.ms[name] = self.ms.get(name, 0.0) + 1e3 * (now - self._last)
+        self._last = now
+
+
+class Renderer:
+    """Renders frames of a mesh sequence.
+
+    Args:
+        sequence: The mesh sequence, or its path.
+        materials: Name or glob of meshes, nodes or materials → :class:`Material` or path of an asset.
+        space: ``"texture"`` shades the atlas and reuses it; ``"screen"`` shades every pixel of every frame.
+        atlas: The atlas, or its resolution [texel]; unused in screen space.
+        size: (width, height) of the pictures [px].
+        camera: A camera path, ``"orbit"``, or the path of a camera file.
+        lights: The lights, a number of default ones, or the path of a lights file.
+        frame_count: Length of the shot, which orbits and default paths are spread over; default: the sequence's.
+        interval: Frames that reuse the shading of the one before them; 0 shades every frame.
+        skip: Which of :data:`SKIPS` are in force. They nest: what is unseen includes what faces away and what no chart
+            owns, so switching off an inner one shows only where the outer ones are off too.
+        background: Radiance where nothing is seen, 3 values.
+        device: Warp device.
+        progress: Passed to :meth:`Atlas.build`.
+
+    Raises:
+        ValueError, OSError, FormatError: As the parts it is made of; each message is one line.
+    """
+
+    def __init__(
+        self,
+        sequence,
+        materials: dict,
+        *,
+        space: str = "texture",
+        atlas: Atlas | int = 1200,
+        size: tuple[int, int] = (1280, 720),
+        camera: CameraPath | str = "orbit",
+        lights: PointLights | int | str = 3,
+        frame_count: int | None = None,
+        interval: int = 4,
+        skip: Iterable[str] = SKIPS,
+        background=(0.0, 0.0, 0.0),
+        device=None,
+        progress=None,
+    ):
+        if space not in ("texture", "screen"):
+            raise ValueError(f'space must be "texture" or "screen", got {space!r}')
+        if not isinstance(interval, int) or interval < 0:
+            raise ValueError(f"interval must be a whole number of frames, 0 or more, got {interval!r}")
+        self.skip = frozenset(skip)
+        if self.skip - set(SKIPS):
+            raise ValueError(f"skip must be among {', '.join(SKIPS)}, got {', '.join(sorted(self.skip - set(SKIPS)))}")
+        self.device, self.space, self.interval = wp.get_device(device), space, interval
+        self.sequence = sequence if isinstance(sequence, MeshSequence) else MeshSequence.load(sequence)
+        self.materials, face_material = bind_materials(self.sequence, materials, device=self.device)
+        self.width, self.height = int(size[0]), int(size[1])
+        frame_count = frame_count or self.sequence.frame_count
+        lo, hi = self.sequence.bounds()
+        if not isinstance(camera, CameraPath):
+            camera = load_camera(camera, lo, hi, frame_count, width=self.width, height=self.height)
+        self.camera = camera
+        self.lights = lights if isinstance(lights, PointLights) else lights_from(lights, lo, hi, frame_count)
+        self.background = wp.vec3(*(float(c) for c in background))
+
+        self.mesh = SurfaceMesh(self.sequence, face_material, device=self.device)
+        self.raster = CameraRaster(
+            self.sequence.faces,
+            self.sequence.vertex_count,
+            self.width,
+            self.height,
+            double_sided=self.sequence.face_double_sided,
+            device=self.device,
+        )
+        pixels = self.width * self.height
+        self._image = wp.zeros((self.height, self.width, 3), dtype=wp.float32, device=self.device)
+        pixel_triangle, pixel_barycentric = self.raster.triangle.flatten(), self.raster.barycentric.flatten()
+
+        def job(kernel, count, inputs, outputs):
+            return dispatch.Job(
+                kernel, dispatch.blocks(count, _PIXELS), inputs=inputs, outputs=outputs, device=self.device, grain=2
+            )
+
+        if space == "screen":
+            self.atlas = None
+            material = wp.zeros(pixels, dtype=wp.uint8, device=self.device)
+            self.shader = self._shader(self.raster.triangle, self.raster.barycentric, material)
+            self._mark = job(
+                worklist.pixel_material_kernel,
+                pixels,
+                [pixel_triangle, pixels, _PIXELS, self.mesh.face_material],
+                [material],
+            )
+            self.shader.share_seen(material)
+            self._show = job(
+                gather.resolve_kernel,
+                pixels,
+                [pixel_triangle, pixels, _PIXELS, self.shader.radiance, self.background],
+                [self._image.flatten()],
+            )
+        else:
+            if not isinstance(atlas, Atlas):
+                atlas = Atlas.build(self.sequence, atlas, progress=progress, device=self.device)
+            self.atlas = atlas
+            side = atlas.resolution
+            owned = atlas.triangle >= 0
+            material = np.where(owned, face_material[np.maximum(atlas.triangle, 0)] + 1, 0)
+            if "unowned" not in self.skip:
+                material[~owned] = 1
+            self._face_texels = np.bincount(atlas.triangle[owned], minlength=len(self.sequence.faces))
+            self._owned = int(owned.sum())
+            triangle = wp.array(atlas.triangle, dtype=wp.int32, device=self.device)
+            material = wp.array(material.ravel(), dtype=wp.uint8, device=self.device)
+            corner_uv = wp.array(atlas.corner_uv.ravel(), dtype=wp.float32, device=self.device)
+            barycentric = wp.array(atlas.barycentric, dtype=wp.float32, device=self.device)
+            self.shader = self._shader(triangle, barycentric, material)
+            pixel = [pixel_triangle, pixel_barycentric, pixels, _PIXELS, corner_uv]
+            self._mark = job(worklist.mark_seen_kernel, pixels, [*pixel, side, side], [self.shader.seen])
+            self._mark_all = job(
+                worklist.mark_facing_kernel,
+                side * side,
+                [
+                    triangle.flatten(),
+                    material,
+                    self.mesh.side,
+                    int("backfacing" not in self.skip),
+                    side * side,
+                    _PIXELS,
+                ],
+                [self.shader.seen],
+            )
+            self._show = job(
+                gather.gather_kernel,
+                pixels,
+                [*pixel, self.shader.radiance, side, side, self.background],
+                [self._image.flatten()],
+            )
+        self._epoch, self._since = 0, 0
+
+    def _shader(self, triangle, barycentric, material) -> TexelShader:
+        return TexelShader(self.mesh, self.materials, triangle, barycentric, material, len(self.lights))
+
+    def render(self, frames: Iterable[int] | None = None) -> Iterator[RenderedFrame]:
+        """Yield the pictures of ``frames`` (default: the whole sequence), in order.
+
+        The first frame, and then every (interval + 1)th, shades anew all that it sees.
+        """
+        self._since = 0
+        for index in range(self.sequence.frame_count) if frames is None else frames:
+            yield self.frame(index)
+
+    def frame(self, index: int) -> RenderedFrame:
+        """Render frame ``index`` as the next picture."""
+        clock = _Clock(self.device)
+        camera = self.camera.at(index)
+        self.mesh.pose(index)
+        clock.stage("mesh")
+        self.raster.run(self.mesh.points, camera.clip())
+        clock.stage("visibility")
+        updated = self.space == "screen" or self._since == 0
+        self._epoch += updated
+        self._since = 0 if self._since == self.interval else self._since + 1
+        self.mesh.face_to(camera.eye)
+        if self.space == "texture":
+            self.shader.seen.zero_()
+            if "unseen" not in self.skip and updated:
+                self._mark_all.run()
+        self._mark.run()
+        clock.stage("mark")
+        counts = self.shader.list(self._epoch)
+        clock.stage("list")
+        evaluations = self.shader.shade(camera.eye, *self.lights.at(index))
+        clock.stage("shade")
+        self._show.run()
+        image = self._image.numpy()
+        clock.stage("gather")
+        texels = {"seen": counts.seen, "shaded": counts.shaded}
+        if self.space == "texture":
+            facing = int(self._face_texels[self.mesh.side.numpy() != 0].sum())
+            texels = {"owned": self._owned, "facing": facing, **texels}
+        else:
+            texels = {"owned": counts.seen, "facing": counts.seen, **texels}
+        return RenderedFrame(
+            index, image, {"ms": clock.ms, "texels": texels, "evaluations": evaluations, "updated": bool(updated)}
+        )

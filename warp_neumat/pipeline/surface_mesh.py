@@ -1,0 +1,95 @@
+"""A mesh sequence on a device: topology once, points, normals and tangents per frame, materials bound to faces."""
+
+import numpy as np
+import warp as wp
+
+from warp_neumat.kernels import dispatch, worklist
+from warp_neumat.materials.base import Material, load
+from warp_neumat.pipeline.sequence import MeshSequence
+
+_FACES_PER_BLOCK = 4096
+
+
+def bind_materials(sequence: MeshSequence, assignments: dict, *, device=None) -> tuple[list[Material], np.ndarray]:
+    """Return the materials in use and the index of each face's.
+
+    Args:
+        sequence: Whose parts are named.
+        assignments: Name or glob of meshes, nodes or materials → :class:`Material` or path of an asset. A later entry
+            wins over an earlier one.
+        device: Warp device for assets that are opened here.
+
+    Returns: Materials, and (F,) int32.
+    Raises:
+        ValueError: If a name matches nothing, a part is left without material, or there are more than 254 materials.
+    """
+    chosen = np.full(len(sequence.mesh_names), -1, np.int32)
+    opened: dict = {}
+    for pattern, material in assignments.items():
+        parts = sequence.select(pattern)
+        key = id(material) if isinstance(material, Material) else str(material)
+        opened.setdefault(key, (len(opened), material))
+        chosen[parts] = opened[key][0]
+    if (chosen < 0).any():
+        missing = ", ".join(repr(sequence.mesh_names[k]) for k in np.flatnonzero(chosen < 0)[:8])
+        raise ValueError(f"{sequence.name}: no material for {missing}; name one, or cover the rest with '*'")
+    used = np.unique(chosen)
+    if len(used) > 254:
+        raise ValueError(f"{sequence.name}: at most 254 materials can be in use, got {len(used)}; merge some")
+    listed = [m for _, m in sorted(opened.values(), key=lambda pair: pair[0])]
+    materials = [m if isinstance(m, Material) else load(m, device=device) for m in (listed[k] for k in used)]
+    return materials, np.searchsorted(used, chosen)[sequence.face_mesh].astype(np.int32)
+
+
+class SurfaceMesh:
+    """Device arrays of a sequence, updated in place.
+
+    Args:
+        sequence: The mesh sequence.
+        face_material: Material index of each face, shape (F,).
+        device: Warp device.
+    """
+
+    def __init__(self, sequence: MeshSequence, face_material: np.ndarray, *, device=None):
+        self.sequence, self.device = sequence, wp.get_device(device)
+        count, faces = sequence.vertex_count, len(sequence.faces)
+        self.face_count = faces
+
+        def array(shape, dtype):
+            return wp.zeros(shape, dtype=dtype, device=self.device)
+
+        self.faces = wp.array(sequence.faces.ravel(), dtype=wp.int32, device=self.device)
+        self.face_material = wp.array(face_material, dtype=wp.int32, device=self.device)
+        self.points, self.normals = array((count, 3), wp.float32), array((count, 3), wp.float32)
+        self.tangents = array((count, 4), wp.float32)
+        self.side = array(faces, wp.int8)
+        double = wp.array(sequence.face_double_sided.astype(np.uint8), dtype=wp.uint8, device=self.device)
+        self._shown = None
+        self._facing = dispatch.Job(
+            worklist.facing_kernel,
+            dispatch.blocks(faces, _FACES_PER_BLOCK),
+            inputs=[self.faces, faces, double, self.points.flatten(), wp.vec3(), _FACES_PER_BLOCK],
+            outputs=[self.side],
+            device=self.device,
+        )
+
+    def pose(self, index: int) -> bool:
+        """Move the mesh to frame ``index``; return whether that changed anything."""
+        frame = self.sequence.frame(index)
+        if frame is self._shown:
+            return False
+        for name in ("points", "normals", "tangents"):
+            self._write(getattr(self, name), getattr(frame, name))
+        self._shown = frame
+        return True
+
+    def _write(self, target: wp.array, values: np.ndarray) -> None:
+        if self.device.is_cpu:
+            target.numpy()[...] = values  # a view: one copy, no allocation
+        else:
+            target.assign(values)
+
+    def face_to(self, eye) -> None:
+        """Find which triangles face ``eye``, into :attr:`side`."""
+        self._facing.set(4, wp.vec3(*(float(c) for c in eye)))
+        self._facing.run()

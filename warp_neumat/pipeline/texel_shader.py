@@ -1,0 +1,162 @@
+"""Shades the listed quads of a sample image: the work list, and one shading job per material."""
+
+import dataclasses
+
+import numpy as np
+import warp as wp
+
+from warp_neumat.kernels import dispatch
+from warp_neumat.kernels.shade import WORDS, Lights, Surface, make_shade_kernel
+from warp_neumat.kernels.worklist import make_list_kernel
+from warp_neumat.materials.base import Material
+from warp_neumat.pipeline.surface_mesh import SurfaceMesh
+
+
+@dataclasses.dataclass(frozen=True)
+class ListCounts:
+    """What the last work list holds: texels that will be read, texels to be shaded, quads of each material."""
+
+    seen: int
+    shaded: int
+    quads: tuple[int, ...]
+
+
+class TexelShader:
+    """Work list and shading for one sample image of ``width`` × ``height`` texels.
+
+    All buffers are allocated here, once. A frame is :meth:`list` and then :meth:`shade`; ``seen`` is written in between
+    frames by whoever knows what is read.
+
+    Args:
+        mesh: The mesh the samples lie on.
+        materials: Materials by index.
+        triangle: Triangle of each texel, −1 = none, int32, shape (height, width), on the device.
+        barycentric: Weights of the second and third vertex, float32, shape (height, width, 2).
+        texel_material: Material index + 1 of each texel, 0 = none, uint8, flat.
+        light_capacity: Most lights that will shine.
+    """
+
+    def __init__(
+        self,
+        mesh: SurfaceMesh,
+        materials: list[Material],
+        triangle: wp.array,
+        barycentric: wp.array,
+        texel_material: wp.array,
+        light_capacity: int,
+    ):
+        self.height, self.width = triangle.shape
+        self.device, self.materials = mesh.device, materials
+        columns, self.rows = -(-self.width // 2), -(-self.height // 2)
+        kinds = len(materials)
+
+        def zeros(count, dtype):
+            return wp.zeros(count, dtype=dtype, device=self.device)
+
+        texels = self.width * self.height
+        self.seen = zeros(texels, wp.uint8)
+        self.radiance = zeros(4 * texels, wp.float16)
+        self.stamp = zeros(columns * self.rows, wp.int32)
+        self._cursor = zeros(kinds * self.rows, wp.int32)
+        self._seen_count, self._shaded_count = zeros(self.rows, wp.int32), zeros(self.rows, wp.int32)
+        # A quad whose four texels have different materials is listed under each.
+        self._quads = zeros(columns * self.rows * min(4, kinds), wp.int32)
+        common = [self.seen, texel_material, self.width, self.height, self.rows, 0, self.stamp]
+        common += [self._cursor, self._seen_count, self._shaded_count, self._quads]
+        self._count_job = dispatch.Job(make_list_kernel(False), self.rows, common, device=self.device, grain=16)
+        self._fill_job = dispatch.Job(make_list_kernel(True), self.rows, common, device=self.device, grain=16)
+
+        surface = Surface()
+        surface.width, surface.height = self.width, self.height
+        surface.triangle, surface.barycentric = triangle.flatten(), barycentric.flatten()
+        surface.texel_material, surface.faces, surface.side = texel_material, mesh.faces, mesh.side
+        surface.points, surface.normals = mesh.points.flatten(), mesh.normals.flatten()
+        surface.tangents = mesh.tangents.flatten()
+        self._keep = (triangle, barycentric, texel_material, surface)
+
+        self._lights = Lights()
+        self._lights.count = 0
+        self._lights.position = zeros(3 * light_capacity, wp.float32)
+        self._lights.intensity = zeros(3 * light_capacity, wp.float32)
+        self._capacity = light_capacity
+
+        self._lanes = dispatch.lanes(self.device)
+        shaders = [material.shader() for material in materials]
+        blocks = dispatch.blocks(4 * self._quads.shape[0], self._lanes) + 1
+        self._evaluations = zeros(blocks, wp.int32)
+        words = max(s.layout.scratch(self._lanes) for s in shaders) + WORDS * self._lanes
+        self._scratch_words = words if self._lanes > 1 else 0
+        self._workers = dispatch.worker_count()
+        self._scratch = zeros(max(1, self._workers * self._scratch_words), wp.float32)
+        self._jobs = [
+            dispatch.Job(
+                make_shade_kernel(s.functions, s.layout, self._lanes),
+                1,
+                inputs=[s.arguments, m, self._quads, 1, surface, self._lights, wp.vec3(), self._scratch],
+                outputs=[self.radiance, self._evaluations],
+                device=self.device,
+                grain=1,
+            )
+            for m, s in enumerate(shaders)
+        ]
+        self._segments: list[tuple[int, int]] = [(0, 0)] * kinds
+
+    def share_seen(self, seen: wp.array) -> None:
+        """Read ``seen``, flat uint8, in place of the own :attr:`seen`."""
+        self.seen = seen
+        for job in (self._count_job, self._fill_job):
+            job.set(0, seen)
+
+    def list(self, epoch: int) -> ListCounts:
+        """Compact the quads with a seen texel that were not yet shaded in ``epoch``, sorted by material; stamp them."""
+        for job in (self._count_job, self._fill_job):
+            job.set(5, int(epoch))
+        self._cursor.zero_()
+        self._count_job.run()
+        counts = self._cursor.numpy()  # [material][row]; on the CPU a view
+        ends = np.cumsum(counts, dtype=np.int64)
+        starts = ends - counts
+        totals = counts.reshape(len(self.materials), self.rows).sum(axis=1)
+        self._segments = [(int(s), int(n)) for s, n in zip(starts[:: self.rows], totals, strict=True)]
+        if self.device.is_cpu:
+            counts[...] = starts
+        else:
+            self._cursor.assign(starts.astype(np.int32))
+        self._fill_job.run()
+        return ListCounts(
+            int(self._seen_count.numpy().sum()), int(self._shaded_count.numpy().sum()), tuple(int(n) for n in totals)
+        )
+
+    def shade(self, eye, position: np.ndarray, intensity: np.ndarray) -> int:
+        """Shade the listed quads into :attr:`radiance`; return the number of material evaluations.
+
+        Args:
+            eye: Position of the viewer, shape (3,).
+            position: Positions of the lights, shape (L, 3).
+            intensity: Radiant intensities [W/sr], shape (L, 3).
+        """
+        count = len(position)
+        if count > self._capacity:
+            raise ValueError(f"at most {self._capacity} lights were announced, got {count}")
+        for target, values in ((self._lights.position, position), (self._lights.intensity, intensity)):
+            padded = np.zeros(3 * self._capacity, np.float32)
+            padded[: 3 * count] = np.asarray(values, np.float32).ravel()
+            target.assign(padded)
+        self._lights.count = count
+        if dispatch.worker_count() > self._workers:
+            self._workers = dispatch.worker_count()
+            self._scratch = wp.zeros(self._workers * self._scratch_words, dtype=wp.float32, device=self.device)
+        evaluations = 0
+        for job, (start, quads) in zip(self._jobs, self._segments, strict=True):
+            if quads == 0:
+                continue
+            listed = wp.array(ptr=self._quads.ptr + 4 * start, shape=(quads,), dtype=wp.int32, device=self.device)
+            job.set(2, listed)
+            job.set(3, quads)
+            job.set(5, self._lights)
+            job.set(6, wp.vec3(*(float(c) for c in eye)))
+            job.set(7, self._scratch)
+            blocks = dispatch.blocks(4 * quads, self._lanes)
+            job.run(blocks)
+            evaluations += int(self._evaluations.numpy()[:blocks].sum(dtype=np.int64))
+        return evaluations

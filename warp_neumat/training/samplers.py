@@ -1,0 +1,82 @@
+"""Where a fit looks at its source: directions drawn from a mixture that covers what pictures show.
+
+A BRDF is nearly constant over most of its domain and rises by orders of magnitude within a degree of the mirror direction,
+so uniform directions alone would hardly ever see a highlight. Three strategies share every batch:
+
+- both directions uniform in the projected hemisphere (what an evenly lit picture shows),
+- ω_o likewise and ω_i mirrored about a half vector at angle θ_h = (π/2)·u², u uniform: MERL's own spacing,
+- ω_o towards the horizon, ω_i likewise or mirrored (Fresnel reflection lives there).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+MIXTURE = {"cosine": 0.35, "peak": 0.45, "grazing": 0.2}
+"""Share of each strategy in a batch."""
+
+
+def _polar(z: np.ndarray, phi: np.ndarray) -> np.ndarray:
+    sine = np.sqrt(np.maximum(1.0 - z * z, 0.0))
+    return np.stack([sine * np.cos(phi), sine * np.sin(phi), z], 1)
+
+
+def _projected(count, rng, power=0.5):
+    """Directions with z = u^power: 0.5 is cosine-weighted, larger leans to the horizon."""
+    u, v = rng.random((2, count))
+    return _polar(u**power, 2 * np.pi * v)
+
+
+def _mirrored(wo, rng):
+    """Reflect ω_o about half vectors with θ_h = (π/2)·u²; what falls below the horizon is drawn again, then dropped up."""
+    wi = np.empty_like(wo)
+    todo = np.arange(len(wo))
+    for _ in range(8):
+        u, v = rng.random((2, len(todo)))
+        half = _polar(np.cos(0.5 * np.pi * u * u), 2 * np.pi * v)
+        view = wo[todo]
+        light = 2.0 * (half * view).sum(1, keepdims=True) * half - view
+        wi[todo] = light
+        todo = todo[light[:, 2] <= 0.0]
+        if not len(todo):
+            break
+    wi[todo] = wo[todo] * (-1.0, -1.0, 1.0)  # the mirror direction itself always lies above
+    return wi
+
+
+class BRDFSampler:
+    """Draws training samples from a BRDF source.
+
+    Args:
+        source: As returned by :func:`warp_neumat.io.brdf.open_brdf`.
+        rng: Its draws are all that the samples depend on.
+    """
+
+    def __init__(self, source, rng: np.random.Generator):
+        self.source, self.rng = source, rng
+
+    def directions(self, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return unit ω_i and ω_o, (count, 3) float32 each, from the mixture, in random order."""
+        rng = self.rng
+        peak, grazing = (int(MIXTURE[k] * count) for k in ("peak", "grazing"))
+        wo = np.concatenate([_projected(count - grazing, rng), _projected(grazing, rng, 1.5)])
+        wi = np.empty_like(wo)
+        cosine = count - grazing - peak
+        wi[:cosine] = _projected(cosine, rng)
+        wi[cosine:-grazing] = _mirrored(wo[cosine : count - grazing], rng)
+        split = count - grazing // 2
+        wi[count - grazing : split] = _mirrored(wo[count - grazing : split], rng)
+        wi[split:] = _projected(count - split, rng, 1.0)
+        wi[:, 2] = np.maximum(wi[:, 2], 1e-4)  # float32 may round a grazing direction below the horizon
+        wo[:, 2] = np.maximum(wo[:, 2], 1e-4)
+        order = rng.permutation(count)
+        wi, wo = wi[order], wo[order]
+        # Which of the two is the viewer is arbitrary for reciprocal data; swapping half covers both grids alike.
+        swap = rng.random(count) < 0.5
+        wi[swap], wo[swap] = wo[swap], wi[swap]
+        return wi.astype(np.float32), wo.astype(np.float32)
+
+    def draw(self, count: int) -> dict[str, np.ndarray]:
+        """Return ``{"wi", "wo", "value"}``, each (count, 3) float32; value in 1/sr without the cosine."""
+        wi, wo = self.directions(count)
+        return {"wi": wi, "wo": wo, "value": self.source.eval(wi, wo)}
