@@ -81,7 +81,9 @@ class Printer:
         for name, width, side in zip(self.columns, self.widths, self.sides, strict=True):
             table.add_column(name, width=width, overflow="fold", justify=side)
         table.add_row(*cells)
-        self.console.print(table, width=max(self.console.width, sum(self.widths) + 2 * len(self.widths)), crop=False)
+        # A line that the terminal wraps reads better than columns squeezed to one letter.
+        self.console.width = max(self.console.width, sum(self.widths) + 2 * len(self.widths))
+        self.console.print(table)
 
 
 def run(name: str, rows: Iterable[dict], columns: list[str], console: Console) -> dict:
@@ -94,8 +96,7 @@ def run(name: str, rows: Iterable[dict], columns: list[str], console: Console) -
         for row in rows:
             printer.add(row)
             done.append(plain(row))
-    # Asked again, because GPUs are only known once the benchmark has loaded Warp.
-    return {"bench": name, "machine": machine(), "versions": versions(), "rows": done}
+    return {"bench": name, "machine": facts, "versions": versions(), "rows": done}
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -125,6 +126,9 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         if options.json:
             check_writable(options.json)  # before minutes of measuring
+        import warp  # not at the top: --list and mistakes answer at once
+
+        warp.config.log_level = warp.LOG_WARNING
         module = importlib.import_module(f"bench.{options.name}")
         rows = module.rows(device=options.device, quick=options.quick)
         document = run(options.name, rows, module.COLUMNS, Console(highlight=False))

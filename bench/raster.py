@@ -1,8 +1,9 @@
 """Camera raster beside primary rays through wp.mesh_query_ray, at 1920×1080 on the same cores.
 
-Both draw triangle id, barycentrics and depth of the same frame. The rays' BVH is built once, before the clock starts; rays
-are launched over the same workers by the same dispatcher, in 8 × 8 pixel blocks, which is the faster order. Columns after
-``mismatch_fraction`` break a frame into its stages [ms], measured one after the other in runs of their own.
+Both draw triangle id, barycentrics and depth of the same frame. The rays' BVH is built once, before the clock starts;
+rays are launched over the same workers by the same dispatcher, in 8 × 8 pixel blocks, which is the faster order.
+Columns after ``mismatch_fraction`` break a frame into its stages [ms], measured one after the other in runs of their
+own.
 """
 
 import os
@@ -99,7 +100,12 @@ def look(points: np.ndarray, width: int, height: int) -> np.ndarray:
     near, far = 0.01 * distance, 100.0 * distance
     f = 2.0 * (distance - size[2] / 2) / front * 0.95
     project = np.array(
-        [[f * height / width, 0, 0, 0], [0, f, 0, 0], [0, 0, far / (near - far), near * far / (near - far)], [0, 0, -1, 0]]
+        [
+            [f * height / width, 0, 0, 0],
+            [0, f, 0, 0],
+            [0, 0, far / (near - far), near * far / (near - far)],
+            [0, 0, -1, 0],
+        ]
     )
     view = np.eye(4)
     view[:3, 3] = -centre - [0.0, 0.0, distance]
@@ -110,16 +116,17 @@ def rows(*, device: str, quick: bool):
     """Yield one row per mesh and number of workers."""
     width, height = (480, 270) if quick else (1920, 1080)
     rounds = 3 if quick else 9
-    before = dispatch._threads
+    available = dispatch.worker_count()
     try:
         for name in ["bunny_low"] if quick else MESHES:
             points, faces = load(name)
             clip = look(points, width, height)
-            # Rays hit both sides, so both sides are drawn.
-            raster = CameraRaster(faces, len(points), width, height, double_sided=np.ones(len(faces)), device=device)
+            # Faces that a file holds twice are one: which of them is hit, says the order of a sum.
+            alike = np.append(np.unique(np.sort(faces, 1), axis=0, return_inverse=True)[1], -1)
+            raster = CameraRaster(faces, len(points), width, height, device=device)
             rays = PrimaryRays(points, faces, clip, width, height, device)
             on_device = wp.array(points, dtype=wp.float32, device=device)
-            for workers in sorted({1, dispatch.worker_count()}) if wp.get_device(device).is_cpu else [1]:
+            for workers in sorted({1, available}) if wp.get_device(device).is_cpu else [1]:
                 dispatch.set_worker_count(workers)
 
                 def draw():
@@ -131,7 +138,7 @@ def rows(*, device: str, quick: bool):
                     wp.synchronize_device(device)
 
                 seconds = interleave({"ours": draw, "peer": trace}, rounds)
-                ours, peer = raster.triangle.numpy(), rays.triangle.numpy()
+                ours, peer = alike[raster.triangle.numpy()], alike[rays.triangle.numpy()]
                 row = {
                     "mesh": name, "triangles": len(faces), "covered": float((ours >= 0).mean()),
                     "width": width, "height": height, "workers": workers,
@@ -139,9 +146,8 @@ def rows(*, device: str, quick: bool):
                     "ratio": seconds["peer"] / seconds["ours"], "mismatch_fraction": float((ours != peer).mean()),
                 }  # fmt: skip
                 yield row | stages(raster, device, rounds)
-                dispatch.set_worker_count(before)
     finally:
-        dispatch.set_worker_count(before)
+        dispatch.set_worker_count(None)
 
 
 def stages(raster: CameraRaster, device: str, rounds: int) -> dict[str, float]:

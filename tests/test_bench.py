@@ -121,6 +121,12 @@ def test_json_holds_all_keys_of_all_rows_and_no_nan(sample, tmp_path, capsys):
     assert list(tmp_path.iterdir()) == [file]
 
 
+def test_a_table_wider_than_the_terminal_keeps_its_columns(sample, capsys):
+    sample.COLUMNS = tuple(f"quite a long column {k}" for k in range(12))
+    assert command.main(["sample"]) == 0
+    assert capsys.readouterr().out.splitlines()[1].split("  ")[:12] == list(sample.COLUMNS)
+
+
 def test_a_benchmark_that_fails_leaves_the_old_json_and_exit_code_1(sample, tmp_path, capsys):
     file = tmp_path / "out.json"
     file.write_text("old")

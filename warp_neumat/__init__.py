@@ -1,1 +1,42 @@
+"""warp_neumat: neural materials on NVIDIA Warp. Fit them, store them, render mesh sequences with them, measure.
+
+The names below are the public Python interface. Each is imported when it is first used, so that ``import warp_neumat``
+costs little and a program pays only for the parts it touches.
+"""
+
+import importlib
+
 __version__ = "0.1.0"
+
+_HOMES = {
+    "Atlas": "pipeline.atlas",
+    "Camera": "pipeline.camera",
+    "Material": "materials.base",
+    "MeshSequence": "pipeline.sequence",
+    "PointLights": "pipeline.lights",
+    "RenderedFrame": "pipeline.renderer",
+    "Renderer": "pipeline.renderer",
+    "corners": "kernels.healpix",
+    "fit": "training.fit",
+    "half_vectors": "kernels.frame",
+    "load": "materials.base",
+    "mlp_eval": "kernels.mlp",
+    "render_shot": "pipeline.shot",
+    "tangent_frames": "kernels.frame",
+    "tonemap": "pipeline.tonemap",
+    "vec2pix": "kernels.healpix",
+}
+
+__all__ = sorted(_HOMES)
+
+
+def __getattr__(name: str):
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__():
+    return sorted({*globals(), *_HOMES})

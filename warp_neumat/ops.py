@@ -6,6 +6,7 @@ Each has a registered shape function, so that it works under ``torch.compile`` a
 from __future__ import annotations
 
 import torch
+import warp as wp
 
 from warp_neumat.kernels import healpix
 
@@ -19,13 +20,14 @@ def healpix_corners(nside: int, direction: torch.Tensor) -> tuple[torch.Tensor, 
         direction: Directions of any length but zero, (N, 3) float32.
 
     Returns:
-        indices (N, 4) int32, numbered ring by ring from the north pole; weights (N, 4) float32 in [0, 1], sum 1. Neither
-        carries a gradient: which corners surround a direction is no differentiable question.
+        indices (N, 4) int32, numbered ring by ring from the north pole; weights (N, 4) float32 in [0, 1], sum 1.
+        Neither carries a gradient: which corners surround a direction is no differentiable question.
 
     Raises:
         ValueError: If ``nside`` or the shape is out of range.
     """
-    # Warp's arrays borrow memory that they own: torch needs tensors of its own to hand out.
+    wp.init()  # at no cost but the first time; mapping a torch device to Warp's needs it
+    # An operator must return memory that torch itself allocated.
     indices = direction.new_empty((direction.shape[0], 4), dtype=torch.int32)
     weights = direction.new_empty((direction.shape[0], 4), dtype=torch.float32)
     healpix.corners(nside, direction.detach().contiguous(), out=(indices, weights))

@@ -45,6 +45,22 @@ end_header
 0 1 0 0 1 0 0 0.25
 3 0 1 {last}
 """
+PLY_BARE = """ply
+format ascii 1.0
+element vertex 3
+property float x
+property float y
+property float z
+element face 1
+property list uchar int vertex_indices
+property list uchar float texcoord
+end_header
+0 0 0
+1 0 0
+0 1 0
+3 0 1 {last} 6 0 0 1 0 0.5 0.75
+"""
+WEDGE = "property list uchar float texcoord\n"
 
 
 def _write(path, text):
@@ -87,7 +103,8 @@ def test_obj_matches_a_plain_reading_of_its_lines(data, name):
     v, vt, vn = np.moveaxis(np.array(corners), 2, 0)
     np.testing.assert_array_equal(_corners(frames), table["v"][v])
     np.testing.assert_array_equal(frames.normals[0][frames.faces], table["vn"][vn])
-    np.testing.assert_array_equal(frames.uv[frames.faces], table["vt"][vt] * [1, -1] + np.array([0, 1], np.float32))
+    np.testing.assert_array_equal(frames.uv[frames.faces][..., 0], table["vt"][vt][..., 0])
+    np.testing.assert_array_equal(frames.uv[frames.faces][..., 1], 1 - table["vt"][vt][..., 1])
 
 
 def test_ply_brings_normals_and_flipped_uv(tmp_path):
@@ -95,6 +112,25 @@ def test_ply_brings_normals_and_flipped_uv(tmp_path):
     assert _corners(frames)[0].tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
     assert frames.normals[0][frames.faces[0]].tolist() == [[0, 0, 1], [0, 0, 1], [0, 1, 0]]
     assert frames.uv[frames.faces[0]].tolist() == [[0, 1], [1, 1], [0, 0.75]]
+
+
+@pytest.mark.parametrize("binary", [False, True])
+def test_ply_uv_per_corner_splits_the_shared_vertices(tmp_path, binary):
+    path = tmp_path / "a.ply"
+    rows = [([0, 1, 2], [0, 0, 1, 0, 0.5, 0.75]), ([0, 2, 1], [0, 0, 0.5, 0.75, 0, 0.25])]
+    head = PLY_BARE.split("end_header")[0].replace("face 1", "face 2") + "end_header\n"
+    if binary:
+        body = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f4").tobytes()
+        for faces, uv in rows:
+            body += b"\x03" + np.array(faces, "<i4").tobytes() + b"\x06" + np.array(uv, "<f4").tobytes()
+        path.write_bytes(head.replace("ascii", "binary_little_endian").encode() + body)
+    else:
+        lines = [f"3 {' '.join(map(str, f))} 6 {' '.join(map(str, uv))}" for f, uv in rows]
+        path.write_text(head + "0 0 0\n1 0 0\n0 1 0\n" + "\n".join(lines) + "\n")
+    frames = load_mesh_frames(path)
+    assert _corners(frames)[1].tolist() == [[0, 0, 0], [0, 1, 0], [1, 0, 0]]
+    assert frames.uv[frames.faces].tolist() == [[[0, 1], [1, 1], [0.5, 0.25]], [[0, 1], [0.5, 0.25], [0, 0.75]]]
+    assert frames.points.shape[1] == 4
 
 
 def test_binary_ply_matches_trimesh(data):
@@ -161,7 +197,12 @@ def test_changing_topology_names_both_files(tmp_path, second, message):
         ("a.obj", "v 0 0 0\nf 0 1 1\n", r"line 2: .*indices count from 1"),
         ("a.obj", "v 0 0 0\n", r"empty mesh, 1 vertices and 0 faces"),
         ("a.obj", "", r"empty mesh, 0 vertices and 0 faces"),
-        ("a.ply", PLY.format(last=7), r"face 0 has vertex index 7 counted from 0, but there are 3"),
+        (
+            "a.ply",
+            PLY_BARE.format(last=7).replace(WEDGE, ""),
+            r"face 0 has vertex index 7 counted from 0, but there are 3",
+        ),
+        ("a.ply", PLY.format(last=7), r"a face has a vertex index out of range \(index 7 .*size 3\)"),
         (
             "a.ply",
             PLY.format(last=2).replace("1 0 0 0 0 1 1 0", "nan 0 0 0 0 1 1 0"),

@@ -185,7 +185,7 @@ def test_corners_match_reference(device, rng, nside):
 
 @pytest.mark.parametrize("nside", [1, 2, 3, 4, 8])
 def test_corner_weights_are_continuous_over_every_edge(device, rng, nside):
-    """Steps across all edges of all pixels: |∇a|, |∇b| ≤ 1.5 nside, so values in [−1, 1] change by ≤ 6 nside a radian."""
+    """Across all edges of all pixels: |∇a|, |∇b| ≤ 1.5 nside, so values in [−1, 1] change by ≤ 6 nside a radian."""
     points = np.concatenate([border_points(rng, nside, 10**6, step=7), AXES])
     points = np.repeat(points / np.linalg.norm(points, axis=1, keepdims=True), 6, axis=0)
     for step in (1e-6, 1e-4, 1e-2):

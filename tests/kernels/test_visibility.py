@@ -80,7 +80,6 @@ def test_raster_matches_reference(rng, kind, tiled):
     assert (error <= 9e-6 * want.slope[seen] + 3e-7).all(), (error / want.slope[seen]).max()
     relative = np.abs(depth[seen] / want.depth[seen] - 1.0).max()
     assert relative < (1e-5 if kind == "far outside" else 1e-6), relative
-    print(f"{kind}: {((error - 1.5e-7) / want.slope[seen]).max():.2e} px, depth {relative:.2e}")
     assert (barycentric >= 0.0).all()
     assert (barycentric.sum(-1) <= 1.0 + 2e-7).all()
     empty = triangle < 0
@@ -100,7 +99,9 @@ def test_closed_mesh_has_no_holes(rng, levels, tiled):
     points, faces = icosphere(levels)
     for _ in range(3):  # from inside, so every pixel sees the mesh, and a hole would show the background
         moved = (points * rng.uniform(0.9, 1.1, (len(points), 1)) + rng.uniform(-0.3, 0.3, 3)).astype(np.float32)
-        triangle, _, depth = draw(moved, faces[:, ::-1], perspective(300, 211, fov=2.0, near=1e-3), 300, 211, tiled=tiled)
+        triangle, _, depth = draw(
+            moved, faces[:, ::-1], perspective(300, 211, fov=2.0, near=1e-3), 300, 211, tiled=tiled
+        )
         assert (triangle >= 0).all()
         assert np.isfinite(depth).all()
     triangle, _, _ = draw(points, faces, perspective(300, 211, fov=2.0, near=1e-3), 300, 211, tiled=tiled)
@@ -218,7 +219,9 @@ def test_raster_sees_what_rays_hit(data):
     wp.launch(_ray_kernel, width * height, [mesh.id, wp.mat33d(inverse), width], [hit], device="cpu")
     rays = hit.numpy().reshape(height, width)
     assert (rays >= 0).mean() > 0.15
-    assert (rays != triangle).mean() < 1e-4 * 5  # edge ties: rays are traced in float32
+    # The file holds 31 faces twice, which count as one; apart from that, no pixel of 76,800 differed in 2026-11.
+    alike = np.append(np.unique(np.sort(faces, 1), axis=0, return_inverse=True)[1], -1)
+    assert (alike[rays] != alike[triangle]).mean() < 1e-4
     seen = triangle >= 0
     p = points[faces[triangle[seen]]].astype(np.float64)
     b = barycentric[seen].astype(np.float64)
@@ -226,7 +229,7 @@ def test_raster_sees_what_rays_hit(data):
     screen = np.concatenate([at, np.ones((len(at), 1))], 1) @ pixel_matrix(clip, width, height).T
     centres = np.stack(np.nonzero(seen)[::-1], -1) + 0.5
     assert np.abs(screen[:, :2] / screen[:, 3:] - centres).max() < 1e-4  # the weights lead back to the pixel centre
-    np.testing.assert_allclose(screen[:, 3], depth[seen], rtol=1e-6)
+    np.testing.assert_allclose(screen[:, 3], depth[seen], rtol=1e-5)
 
 
 def test_depth_range_is_what_the_matrix_says():
@@ -243,7 +246,9 @@ def test_depth_range_is_what_the_matrix_says():
 
 def test_nearer_than_near_and_farther_than_far_is_cut():
     clip = perspective(64, 64, near=1.0, far=10.0)
-    plane = np.array([[-9, -1, 20], [9, -1, 20], [0, -1, -900]], np.float32)  # a floor from behind the eye to beyond far
+    plane = np.array(
+        [[-9, -1, 20], [9, -1, 20], [0, -1, -900]], np.float32
+    )  # a floor from behind the eye to beyond far
     _, _, depth = draw(plane, np.array([[0, 1, 2]]), clip, 64, 64)
     drawn = depth[np.isfinite(depth)]
     assert drawn.size > 200

@@ -42,7 +42,7 @@ def fake_report(count=COUNT, interval=4, error=True):
         entry["texels"] = {"owned": 820_000, "facing": 430_000 + 2000 * k, "seen": seen, "shaded": shaded}
         if error:
             entry["ms"]["reference"] = rng.uniform(250, 300)
-            flip = 0.004 + 0.004 * (k % (interval + 1)) + rng.uniform(0, 1e-3)
+            flip = 0.0 if fresh else 0.004 * (k % (interval + 1)) + rng.uniform(0, 1e-3)
             psnr = math.inf if fresh else -20 * math.log10(flip)
             entry["error"] = {"psnr": psnr, "ssim": 1 - flip / 2, "flip": np.float32(flip)}
         frames.append(entry)

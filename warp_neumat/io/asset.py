@@ -1,20 +1,21 @@
 """The `.neumat` container: one safetensors file whose metadata holds a JSON header under the key ``neumat``.
 
-The header states kind, version, the resolved config, the source, training facts and metrics; the tensors are what the kind
-defines. Files are written beside their target and renamed, so that a reader never meets half a file. Nothing is pickled.
+The header states kind, version, the resolved config, the source, training facts and metrics; the tensors are what the
+kind defines. Files are written beside their target and renamed, so that a reader never meets half a file. Nothing is
+pickled.
 """
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
-import tempfile
 from pathlib import Path
 
 import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
+
+from warp_neumat.io.atomic import replacing
 
 KINDS = {"neubrdf": 1}
 """Known kinds and the newest version of each that this release reads."""
@@ -51,32 +52,8 @@ def write_asset(path: str | os.PathLike, tensors: dict[str, np.ndarray], header:
     _check_header(path, header)
     text = json.dumps(header, ensure_ascii=False, allow_nan=False)
     content = save({k: np.ascontiguousarray(v) for k, v in tensors.items()}, metadata={_KEY: text})
-    write_atomically(path, content)
-
-
-def write_atomically(path: str | os.PathLike, content: bytes) -> None:
-    """Write ``content`` to a temporary file in the folder of ``path``, then rename it; raise OSError naming the folder."""
-    path = Path(path)
-    temporary = None
-    try:
-        handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-        os.chmod(temporary, 0o666 & ~_umask())
-        os.replace(temporary, path)
-    except OSError as error:
-        if temporary is not None:
-            with contextlib.suppress(OSError):
-                os.unlink(temporary)
-        message = f"cannot write {path.name} ({error.strerror}); choose an existing folder that you may write to"
-        raise type(error)(error.errno, message, str(path.parent)) from None
-
-
-def _umask() -> int:
-    """Return the process's umask, which mkstemp ignores: others could not read the asset otherwise."""
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
+    with replacing(path) as temporary:
+        temporary.write_bytes(content)
 
 
 def read_asset(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], dict]:
@@ -96,11 +73,15 @@ def read_asset(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], dict]:
             tensors = {name: file.get_tensor(name) for name in sorted(file.keys())}  # noqa: SIM118 (no iterator)
     except SafetensorError as error:
         reason = str(error).splitlines()[0]
-        raise FormatError(path, "file", f"truncated or no safetensors file ({reason})", "copy or fit it again") from None
+        raise FormatError(
+            path, "file", f"truncated or no safetensors file ({reason})", "copy or fit it again"
+        ) from None
     except (TypeError, AttributeError, KeyError) as error:  # element types that numpy does not have, as bf16
         raise FormatError(path, "file", f"holds a tensor type that numpy lacks ({error})", "fit it again") from None
     if _KEY not in metadata:
-        raise FormatError(path, _KEY, "missing in the metadata, so this is no neumat asset", "make one with `neumat fit`")
+        raise FormatError(
+            path, _KEY, "missing in the metadata, so this is no neumat asset", "make one with `neumat fit`"
+        )
     try:
         header = json.loads(metadata[_KEY])
     except json.JSONDecodeError as error:
@@ -156,7 +137,9 @@ def pack_bits(values: np.ndarray, bits: int) -> np.ndarray:
     if not 1 <= bits <= 16:
         raise ValueError(f"bits must be in [1, 16], got {bits}")
     if values.size and (values.min() < 0 or values.max() >> bits):
-        raise ValueError(f"values must lie in [0, {(1 << bits) - 1}] for {bits} bits, got {values.min()} … {values.max()}")
+        raise ValueError(
+            f"values must lie in [0, {(1 << bits) - 1}] for {bits} bits, got {values.min()} … {values.max()}"
+        )
     planes = (values.astype(np.uint16)[:, None] >> np.arange(bits, dtype=np.uint16)) & np.uint16(1)
     return np.packbits(planes.astype(np.uint8).ravel(), bitorder="little")
 

@@ -3,9 +3,10 @@
 ω_i points to the light and ω_o to the viewer, both unit and away from the surface, in a frame with z = shading normal.
 A source returns the BRDF value in 1/sr, linear Rec. 709 RGB, **without** the cosine; below the horizon it is 0.
 
-Half and difference vector are those of Rusinkiewicz, "A New Change of Variables for Efficient BRDF Representation", 1998.
-The functions in the npz files are those of Sztrajman et al., "Neural BRDF Representation and Importance Sampling", 2021.
-The microfacet model is GGX (Walter et al. 2007) with Heitz's height-correlated Smith shadowing (2014, Eq. 99).
+Half and difference vector are those of Rusinkiewicz, "A New Change of Variables for Efficient BRDF Representation",
+1998. The functions in the npz files are those of Sztrajman et al., "Neural BRDF Representation and Importance
+Sampling", 2021. The microfacet model is GGX (Walter et al. 2007) with Heitz's height-correlated Smith shadowing (2014,
+Eq. 99).
 """
 
 from __future__ import annotations
@@ -37,8 +38,8 @@ def open_brdf(spec: str) -> BRDFSource:
     """Return the BRDF source that ``spec`` names.
 
     Args:
-        spec: ``FILE.npz:NAME`` (one of the functions stored in the file), ``analytic:ggx?KEY=VALUE&…`` with the fields of
-            :class:`GGX`, or ``analytic:lambert?albedo=R,G,B``. FILE may contain colons.
+        spec: ``FILE.npz:NAME`` (one of the functions stored in the file), ``analytic:ggx?KEY=VALUE&…`` with the
+            fields of :class:`GGX`, or ``analytic:lambert?albedo=R,G,B``. FILE may contain colons.
 
     Raises:
         ValueError: If the specification, a key or a value is wrong; unknown names list the nearest known ones.
@@ -52,7 +53,8 @@ def open_brdf(spec: str) -> BRDFSource:
     if spec.lower().endswith(".npz"):
         raise ValueError(f"{spec}: the file holds many materials; name one as {spec}:NAME{_example(spec)}")
     raise ValueError(
-        f"{spec!r} is no BRDF source; use FILE.npz:NAME, analytic:ggx?roughness=0.2&f0=0.9,0.6,0.3 or analytic:lambert?albedo=0.5"
+        f"{spec!r} is no BRDF source; use FILE.npz:NAME, analytic:ggx?roughness=0.2&f0=0.9,0.6,0.3"
+        " or analytic:lambert?albedo=0.5"
     )
 
 
@@ -191,9 +193,9 @@ class Lambert:
 class GGX:
     """GGX reflection over a diffuse base: f = diffuse/π + F·D·V, V = G₂/(4 cosθ_i cosθ_o).
 
-    alpha = roughness². With anisotropy a, aspect = sqrt(1 − 0.9 a): alpha_x = alpha/aspect along x, alpha_y = alpha·aspect.
-    G₂ is the height-correlated Smith term; F is Schlick's with ``f0``. The diffuse part is not dimmed by F, so the model
-    is reciprocal but conserves energy only for diffuse + f0 < 1.
+    alpha = roughness². With anisotropy a, aspect = sqrt(1 − 0.9 a): alpha_x = alpha/aspect along x, alpha_y =
+    alpha·aspect. G₂ is the height-correlated Smith term; F is Schlick's with ``f0``. The diffuse part is not dimmed by
+    F, so the model is reciprocal but conserves energy only for diffuse + f0 < 1.
     """
 
     roughness: float = 0.3
@@ -236,7 +238,14 @@ class GGX:
 
 
 _ANALYTIC = {"ggx": GGX, "lambert": Lambert}
-_RANGES = {"roughness": (0.01, 1.0), "f0": (0, 1), "diffuse": (0, 1), "albedo": (0, 1), "anisotropy": (0, 1), "ior": (1, 10)}
+_RANGES = {
+    "roughness": (0.01, 1.0),
+    "f0": (0, 1),
+    "diffuse": (0, 1),
+    "albedo": (0, 1),
+    "anisotropy": (0, 1),
+    "ior": (1, 10),
+}
 _COLOURS = ("f0", "diffuse", "albedo")
 
 

@@ -161,33 +161,49 @@ def _corner(token: str, rows: dict[str, list], tokens: dict) -> tuple[int, int, 
 
 
 def _read_ply(path: Path) -> _Polygons:
+    """Read positions, faces, normals and uv (per vertex, or per corner as ``texcoord``) of a PLY."""
     import trimesh
 
     try:
-        with path.open("rb") as file:
-            mesh = trimesh.load(file, file_type="ply", process=False)
+        with path.open("rb") as file:  # fix_texture would renumber the vertices
+            mesh = trimesh.load(file, file_type="ply", process=False, fix_texture=False)
         if not isinstance(mesh, trimesh.Trimesh):
             raise ValueError("it holds no faces")
         points, faces = np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.int64).reshape(-1, 3)
+        raw = mesh.metadata["_ply_raw"]
+        uv = _columns(raw, ("s", "t"), ("u", "v"), ("texture_u", "texture_v"))
+        normals = _columns(raw, ("nx", "ny", "nz"))
+        wedge = _wedge_uv(raw, len(faces))
     except Exception as error:  # trimesh raises whatever the broken bytes lead it into
+        if "out of bounds for axis" in str(error):
+            raise ValueError(f"{path}: a face has a vertex index out of range ({error})") from None
         raise ValueError(f"{path}: not a readable PLY mesh ({type(error).__name__}: {error})") from None
-    raw = mesh.metadata.get("_ply_raw", {}).get("vertex", {}).get("data")
-    names = (raw.dtype.names or ()) if isinstance(raw, np.ndarray) else tuple(raw or ())
-
-    def columns(*options: tuple[str, ...]) -> np.ndarray:
-        for option in options:
-            if all(name in names for name in option):
-                return np.stack([np.asarray(raw[name], np.float32).reshape(-1) for name in option], axis=1)
-        return np.zeros((0, len(options[0])), np.float32)
-
-    uv = columns(("s", "t"), ("u", "v"), ("texture_u", "texture_v"))
-    normals = columns(("nx", "ny", "nz"))
-    corners = np.full((len(faces), 3, 3), -1, np.int64)
-    for k, attribute in enumerate((points, uv, normals)):
-        if len(attribute):
-            corners[:, :, k] = faces
+    corners = np.stack([faces, faces if len(uv) else faces * 0 - 1, faces if len(normals) else faces * 0 - 1], axis=2)
+    if wedge is not None:
+        uv, index = np.unique(wedge.reshape(-1, 2), axis=0, return_inverse=True)
+        corners[:, :, 1] = index.reshape(-1, 3)
     face_part = np.zeros(len(faces), np.int32)
     return _Polygons(path, points, uv, normals, corners, face_part, [(path.stem, "default")])
+
+
+def _columns(raw: dict, *options: tuple[str, ...]) -> np.ndarray:
+    """Return the vertex properties of the first option that the file has, (V, n) or (0, n)."""
+    data = raw["vertex"]["data"]
+    for option in options:
+        if all(name in raw["vertex"]["properties"] for name in option):
+            return np.stack([np.asarray(data[name], np.float32).reshape(-1) for name in option], axis=1)
+    return np.zeros((0, len(options[0])), np.float32)
+
+
+def _wedge_uv(raw: dict, face_count: int) -> np.ndarray | None:
+    """Return uv per face corner (F, 6), or None where faces carry none."""
+    if "texcoord" not in raw["face"]["properties"]:
+        return None
+    uv = raw["face"]["data"]["texcoord"]
+    uv = np.asarray(uv["f1"] if getattr(uv, "dtype", None) is not None and uv.dtype.names else uv, np.float32)
+    if uv.shape != (face_count, 6):
+        raise ValueError("its polygons carry uv per corner; triangulate the mesh first")
+    return uv
 
 
 # ---- frames of one topology
@@ -260,8 +276,9 @@ def _load_folder(folder: Path, progress: Callable[[int, int], None] | None) -> M
         raise ValueError(f"{folder}: mixes .obj and .ply frames; keep one kind in the folder")
     corners, frame = _first_frame(files[0])
     frames = [frame]
-    for k, file in enumerate(files[1:], 1):
-        frames.append(corners.gather(_read_polygons(file, k)))
+    for k, file in enumerate(files):
+        if k > 0:
+            frames.append(corners.gather(_read_polygons(file, k)))
         if progress:
             progress(k + 1, len(files))
     return _assemble(folder.resolve().name, corners, frames)

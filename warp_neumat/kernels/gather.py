@@ -31,9 +31,7 @@ def gather_kernel(
     for i in range(b * per_block, wp.min((b + 1) * per_block, pixel_count)):
         f = pixel_triangle[i]
         if f >= 0:
-            x, y, u, v = footprint(
-                corner_uv, f, pixel_barycentric[2 * i], pixel_barycentric[2 * i + 1], width, height
-            )
+            x, y, u, v = footprint(corner_uv, f, pixel_barycentric[2 * i], pixel_barycentric[2 * i + 1], width, height)
             at = 4 * (y * width + x)
             below = at + 4 * width
             for c in range(3):

@@ -136,18 +136,20 @@ def _vector_code(layout: Layout, lanes: int, *, vector: int, rows: int, vectors:
             adds = "".join(f" a{r}_{u} += w{u} * s;" for u in range(vectors))
             text.append(f"{{ const float s = h{source}[{r * width} + k];{adds} }}")
         text.append("}")
-        text += [
-            f"*(V*)(h{1 - source} + {r * out} + o + {u} * NV) = a{r}_{u} > 0.0f ? a{r}_{u} : Z;" for r, u in cells
-        ]
+        text += [f"*(V*)(h{1 - source} + {r * out} + o + {u} * NV) = a{r}_{u} > 0.0f ? a{r}_{u} : Z;" for r, u in cells]
         text.append("}")
         offset += out + width * out
         source, width = 1 - source, out
     text.append(f"const float* wl = weights.data + {offset + 3};")
-    text.append(f"for (int r = 0; r < {rows}; ++r) {{ V s0 = Z, s1 = Z, s2 = Z; const float* h = h{source} + r * {width};")
+    text.append(
+        f"for (int r = 0; r < {rows}; ++r) {{ V s0 = Z, s1 = Z, s2 = Z; const float* h = h{source} + r * {width};"
+    )
     text.append(f"for (int j = 0; j < {width}; j += NV) {{ const V v = *(const V*)(h + j);")
     text += [f"s{c} += v * *(const V*)(wl + {c * width} + j);" for c in range(3)]
     text.append("}")
-    text.append("float f0 = 0.0f, f1 = 0.0f, f2 = 0.0f; for (int u = 0; u < NV; ++u) { f0 += s0[u]; f1 += s1[u]; f2 += s2[u]; }")
+    text.append(
+        "float f0 = 0.0f, f1 = 0.0f, f2 = 0.0f; for (int u = 0; u < NV; ++u) { f0 += s0[u]; f1 += s1[u]; f2 += s2[u]; }"
+    )
     text += [f"y.data[{c * lanes} + lane[r]] = f{c} + weights.data[{offset + c}];" for c in range(3)]
     text.append("} }")
     return "\n".join(text)

@@ -66,9 +66,7 @@ def mark_facing_kernel(
 
 
 @wp.func
-def footprint(
-    corner_uv: wp.array(dtype=wp.float32), f: int, b1: float, b2: float, width: int, height: int
-):
+def footprint(corner_uv: wp.array(dtype=wp.float32), f: int, b1: float, b2: float, width: int, height: int):
     """Return (x, y, u, v): upper left texel of the bilinear footprint of a point of triangle ``f``, and its fractions.
 
     Texel i is centred at i + 0.5. The footprint is kept inside the texture.
@@ -102,9 +100,7 @@ def mark_seen_kernel(
     for i in range(b * per_block, wp.min((b + 1) * per_block, pixel_count)):
         f = pixel_triangle[i]
         if f >= 0:
-            x, y, u, v = footprint(
-                corner_uv, f, pixel_barycentric[2 * i], pixel_barycentric[2 * i + 1], width, height
-            )
+            x, y, u, v = footprint(corner_uv, f, pixel_barycentric[2 * i], pixel_barycentric[2 * i + 1], width, height)
             at = y * width + x
             seen[at] = wp.uint8(1)
             seen[at + 1] = wp.uint8(1)

@@ -1,9 +1,10 @@
 """The fitting side of every model. A model is a module; the registry imports it only when it is asked for.
 
-What :mod:`warp_neumat.training` relies on, of a module: ``DATA`` (kind of source), ``configure(source, options) -> config``,
-``build(config, seed) -> model``, ``from_asset(tensors, config) -> model``, ``DEFAULT_STEPS``; of a model (a ``torch.nn.Module``):
-``prepare(samples) -> batch``, ``predict(batch)``, ``stages()``, ``trainable(stage)``, ``begin``, ``enter``, ``event``,
-``to_asset()``, ``statistics()`` and ``evaluate(*inputs)``; :class:`warp_neumat.models.neubrdf.NeuBRDF` says what each does.
+What :mod:`warp_neumat.training` relies on, of a module: ``DATA`` (kind of source), ``configure(source, options) ->
+config``, ``build(config, seed) -> model``, ``from_asset(tensors, config) -> model``, ``DEFAULT_STEPS``; of a model (a
+``torch.nn.Module``): ``prepare(samples) -> batch``, ``predict(batch)``, ``stages()``, ``trainable(stage)``, ``begin``,
+``enter``, ``event``, ``to_asset()``, ``statistics()`` and ``evaluate(*inputs)``;
+:class:`warp_neumat.models.neubrdf.NeuBRDF` says what each does.
 """
 
 import difflib

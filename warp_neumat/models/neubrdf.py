@@ -1,14 +1,15 @@
 """NeuBRDF, the fitting side: two HEALPix corner grids of features, quantised to shared primitives, and a small decoder.
 
-Paper [neubrdf], Sec. 3 (Eq. 1–3). ψ_i = Σ_t w_t D[S_i[p_t]] at ω_i, ψ_o the same at ω_o, f = max(exp(MLP([ψ_i, ψ_o])) − 1, 0).
-Differs: bilinear corner weights in the pixel's own coordinates (continuous; the paper trains with inverse distance and runs
-with 1/4); the decoder predicts log(1 + f), because mirror peaks of several hundred stand beside diffuse values of 0.01; an
-isotropic source is fitted in the frame where ω_o has azimuth 0 and ω_i is mirrored to y ≥ 0, which leaves the codebook half a
-grid and one meridian to describe.
+Paper [neubrdf], Sec. 3 (Eq. 1–3). ψ_i = Σ_t w_t D[S_i[p_t]] at ω_i, ψ_o the same at ω_o, f = max(exp(MLP([ψ_i, ψ_o])) −
+1, 0). Differs: bilinear corner weights in the pixel's own coordinates (continuous; the paper trains with inverse
+distance and runs with 1/4); the decoder predicts log(1 + f), because mirror peaks of several hundred stand beside
+diffuse values of 0.01; an isotropic source is fitted in the frame where ω_o has azimuth 0 and ω_i is mirrored to y ≥ 0,
+which leaves the codebook half a grid and one meridian to describe.
 
-The fit: (1) ``features``: every grid point owns its features; (2) ``codebook``: they are quantised under the metric of the
-loss (:mod:`warp_neumat.models.codebook`), then codebook and decoder are tuned, with re-assignments in between; (3) ``round``:
-indices fixed, all values rounded to fp16 in the forward pass. The plain torch forward is the reference of the Warp kernel.
+The fit: (1) ``features``: every grid point owns its features; (2) ``codebook``: they are quantised under the metric of
+the loss (:mod:`warp_neumat.models.codebook`), then codebook and decoder are tuned, with re-assignments in between; (3)
+``round``: indices fixed, all values rounded to fp16 in the forward pass. The plain torch forward is the reference of
+the Warp kernel.
 """
 
 from __future__ import annotations
@@ -22,13 +23,18 @@ from torch import nn
 from torch.nn.functional import embedding_bag
 
 from warp_neumat import ops
-from warp_neumat.io.asset import pack_bits
+from warp_neumat.io.asset import pack_bits, unpack_bits
 from warp_neumat.models import codebook as vq
 
 DATA = "brdf"
 """What kind of source the model is fitted to; :mod:`warp_neumat.training` picks sampler, loss and evaluation by it."""
 
 VERSION = 1
+
+_DAMPING = 0.02  # of a point's own curvature; keeps directions that the decoder ignores from running away
+
+DEFAULT_STEPS = 4000
+"""Optimiser steps of a fit where the caller names none."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,7 +64,11 @@ class NeuBRDFConfig:
                 raise ValueError(f"{name} must be a whole number in [{low}, {high}], got {value!r}")
         if len(self.hidden) != 2 or any(width < 8 or width % 8 for width in self.hidden):
             raise ValueError(f"hidden must be two multiples of 8, as 64,64, got {self.hidden}")
-        for name, allowed in (("interpolation", ("bilinear",)), ("frame", ("absolute", "isotropic")), ("output", ("expm1",))):
+        for name, allowed in (
+            ("interpolation", ("bilinear",)),
+            ("frame", ("absolute", "isotropic")),
+            ("output", ("expm1",)),
+        ):
             if getattr(self, name) not in allowed:
                 raise ValueError(f"{name} must be one of {', '.join(allowed)}, got {getattr(self, name)!r}")
 
@@ -69,7 +79,10 @@ class NeuBRDFConfig:
 
 
 def configure(source, options: dict) -> NeuBRDFConfig:
-    """Return the config for ``source``: ``options`` over the defaults; isotropic sources get the isotropic frame.
+    """Return the config for ``source``: ``options`` over the defaults.
+
+    Isotropic sources get the isotropic frame and nside 32: with the paper's 64, 512 primitives are too few for the
+    points, and a file of twice the size shows twice the error (alum-bronze, same steps).
 
     Raises:
         ValueError: If an option is unknown (names the nearest) or out of range.
@@ -79,15 +92,15 @@ def configure(source, options: dict) -> NeuBRDFConfig:
         if key not in fields:
             close = difflib.get_close_matches(key, fields, n=1, cutoff=0.0)[0]
             raise ValueError(f"neubrdf has no option {key!r}; nearest: {close}; known: {', '.join(fields)}")
-    frame = "isotropic" if source.isotropic else "absolute"
-    return NeuBRDFConfig(**{"frame": frame, **options})
+    defaults = {"frame": "isotropic", "nside": 32} if source.isotropic else {}
+    return NeuBRDFConfig(**{**defaults, **options})
 
 
 def grid_points(nside: int) -> np.ndarray:
     """Return the unit directions of the n grid points, (n, 3) float64, ring by ring from the pole.
 
-    Corner rings of HEALPix (Górski et al. 2005): cap ring r < N at z = 1 − r²/(3N²) with 4r points at φ = j(π/2)/r, belt ring
-    r ≥ N at z = 2(2N − r)/(3N) with 4N points at φ = (j + ½[(r − N) odd])π/(2N).
+    Corner rings of HEALPix (Górski et al. 2005): cap ring r < N at z = 1 − r²/(3N²) with 4r points at φ = j(π/2)/r,
+    belt ring r ≥ N at z = 2(2N − r)/(3N) with 4N points at φ = (j + ½[(r − N) odd])π/(2N).
     """
     rings = [np.array([[0.0, 0.0, 1.0]])]
     for ring in range(1, 2 * nside + 2):
@@ -103,8 +116,9 @@ def grid_points(nside: int) -> np.ndarray:
 def colours(nside: int) -> torch.Tensor:
     """Return a colour 0 … 3 of every grid point, (n,), such that the corners of a pixel differ.
 
-    The corners of a pixel are one point of ring r, two neighbours of ring r + 1 and one of ring r + 2. (Along the seams of the
-    base pixels and at |z| = 2/3 some pixels have two corners of one colour: harmless, they are then moved together.)
+    The corners of a pixel are one point of ring r, two neighbours of ring r + 1 and one of ring r + 2. (Along the seams
+    of the base pixels and at |z| = 2/3 some pixels have two corners of one colour: harmless, they are then moved
+    together.)
     """
     rings = []
     for ring in range(2 * nside + 2):
@@ -125,7 +139,7 @@ def _scatter(out: torch.Tensor, corner: torch.Tensor, weight: torch.Tensor, rows
 
 
 def to_local_frame(wi: torch.Tensor, wo: torch.Tensor, frame: str) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the directions as the grids see them; torch twin of :func:`warp_neumat.reference.neubrdf.to_local_frame`."""
+    """Return the directions as the grids see them; torch twin of ``reference.neubrdf.to_local_frame``."""
     if frame == "absolute":
         return wi, wo
     square = wo[:, 0] ** 2 + wo[:, 1] ** 2
@@ -172,9 +186,11 @@ class NeuBRDF(nn.Module):
 
     # --- evaluation ---
 
-    def prepare(self, wi: torch.Tensor, wo: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Return ``corner`` (B, 8) int32 (4 of ω_i, 4 of ω_o, offset by n) and ``weight`` (B, 8) float32."""
-        local = to_local_frame(wi, wo, self.config.frame)
+    def prepare(self, samples: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+        """Find the grid points of unit directions ``wi`` and ``wo``, (B, 3) each, once for all later passes.
+
+        Returns ``corner`` (B, 8) int32 (4 of ω_i, 4 of ω_o, offset by n) and ``weight`` (B, 8) float32."""
+        local = to_local_frame(samples["wi"], samples["wo"], self.config.frame)
         pairs = [ops.healpix_corners(self.config.nside, direction.contiguous()) for direction in local]
         corner = torch.cat([pairs[0][0], pairs[1][0] + self.config.points], 1)
         return {"corner": corner, "weight": torch.cat([pairs[0][1], pairs[1][1]], 1)}
@@ -209,8 +225,19 @@ class NeuBRDF(nn.Module):
 
         Error: see tests/models/test_neubrdf.py::test_forward_matches_float64.
         """
-        value = torch.expm1(self.decode(self.gather(self.prepare(wi, wo)))).clamp_min(0.0)
+        value = torch.expm1(self.decode(self.gather(self.prepare({"wi": wi, "wo": wo})))).clamp_min(0.0)
         return torch.where((wi[:, 2:] > 0) & (wo[:, 2:] > 0), value, 0.0)
+
+    @torch.no_grad()
+    def evaluate(self, wi: np.ndarray, wo: np.ndarray) -> np.ndarray:
+        """Return :meth:`forward` for numpy directions, (N, 3) float32."""
+        parts = [slice(i, i + (1 << 16)) for i in range(0, len(wi), 1 << 16)]
+        wi, wo = (torch.from_numpy(np.ascontiguousarray(d, np.float32)) for d in (wi, wo))
+        return (
+            np.concatenate([self(wi[part], wo[part]).numpy() for part in parts])
+            if parts
+            else np.empty((0, 3), np.float32)
+        )
 
     # --- the fit's stages ---
 
@@ -226,44 +253,56 @@ class NeuBRDF(nn.Module):
         """Return the parameters that ``stage`` trains."""
         return [self.table if stage == "features" else self.codebook, *self.layers.parameters()]
 
-    def begin(self, stage: str, batches, loss, generator) -> None:
-        """Prepare ``stage``; ``batches()`` yields prepared batches, ``loss.residual(value, batch)`` is what is squared."""
+    def event_samples(self) -> int:
+        """Return how many samples :meth:`begin` and :meth:`event` need to know every grid point."""
+        return min(max(4096, 32 * self.config.points), 1 << 18)
+
+    def begin(self, stage: str, batches, loss, generator: torch.Generator) -> None:
+        """Prepare ``stage`` from prepared ``batches``; ``loss.residual(value, batch)`` is what is squared."""
         if stage == "codebook":
-            metric = self.metric(batches(), loss)
-            words, index = vq.fit(self.table.detach(), metric, 1 << self.config.bits, generator)
+            metric = self.metric(batches, loss)
+            words, index = vq.fit(self.table.detach().cpu(), metric.cpu(), 1 << self.config.bits, generator)
             with torch.no_grad():
                 self.codebook.copy_(words)
                 self.indices.copy_(index.int())
                 self.quantised.fill_(True)
+
+    def enter(self, stage: str) -> None:
+        """Set what ``stage`` needs beyond the state that a checkpoint holds."""
         self.rounded = stage == "round"
 
     def event(self, stage: str, batches, loss) -> None:
-        """Choose the primitive of every grid point anew: one Gauss–Seidel sweep on a fixed set of samples.
+        """Choose the primitive of every grid point anew: one Gauss–Seidel sweep on a fixed list of ``batches``.
 
-        Points of one colour share no pixel, so with all others fixed each sees an exact least-squares problem of its own
-        (but for the decoder's curvature). What one colour leaves over, the next takes into account: neighbours learn to
-        average to values that no primitive holds.
+        Points of one colour share no pixel, so with all others fixed each sees an exact least-squares problem of its
+        own (but for the decoder's curvature). What one colour leaves over, the next takes into account: neighbours
+        learn to average to values that no primitive holds. Unused primitives move to the points that want to move most.
         """
-        samples = list(batches())
-        metric = self.metric(samples, loss)
-        words, points, moved = self.codebook.detach(), self.config.points, 0
+        metric = self.metric(batches, loss)
+        words, points = self.codebook.detach(), self.config.points
         size = metric.diagonal(dim1=1, dim2=2).mean(1)
-        side = torch.arange(2 * points) // points
+        side = torch.arange(2 * points, device=words.device) // points
+        eye = torch.eye(self.config.features, device=words.device)
         for part in range(8):
             live = torch.nonzero((size > 0) & (side == part // 4) & (self.colour == part % 4)).flatten()
-            gradient = self.gradient(samples, loss)[live]
-            local = metric[live] + (0.02 * size[live])[:, None, None] * torch.eye(self.config.features)
-            target = words[self.indices[live]] - torch.linalg.solve(local, gradient)
-            index = vq.assign(target, local, words)[0].int()
-            moved += int((index != self.indices[live]).sum())
-            self.indices[live] = index
-        self.moved = moved / max(1, int((size > 0).sum()))
+            if not len(live):
+                continue
+            local = metric[live] + (_DAMPING * size[live])[:, None, None] * eye
+            step = torch.linalg.solve(local, self.gradient(batches, loss)[live])
+            target = words[self.indices[live]] - step
+            index, cost = vq.assign(target, local, words)
+            unused = torch.nonzero(torch.bincount(self.indices, minlength=len(words)) == 0).flatten()[: len(live) // 8]
+            if len(unused):
+                costly = cost.topk(len(unused)).indices
+                words[unused] = target[costly]
+                index[costly] = unused
+            self.indices[live] = index.int()
 
-    def metric(self, samples, loss) -> torch.Tensor:
+    def metric(self, batches, loss) -> torch.Tensor:
         """Return H = Σ w² JᵀJ of every grid point, (2n, k, k), J the derivative of the residuals by ψ, w the weight."""
         k, points = self.config.features, self.config.points
-        metric = torch.zeros(2 * points, k * k)
-        for batch in samples:
+        metric = self.table.new_zeros(2 * points, k * k)
+        for batch in batches:
             psi = self.gather(batch).detach().requires_grad_()
             residual = loss.residual(torch.expm1(self.decode(psi).clamp_max(16.0)), batch)
             jacobian = [torch.autograd.grad(residual[:, c].sum(), psi, retain_graph=c < 2)[0] for c in range(3)]
@@ -272,11 +311,11 @@ class NeuBRDF(nn.Module):
             _scatter(metric, batch["corner"].view(-1, 4), batch["weight"].view(-1, 4) ** 2, square)
         return metric.view(2 * points, k, k)
 
-    def gradient(self, samples, loss) -> torch.Tensor:
+    def gradient(self, batches, loss) -> torch.Tensor:
         """Return Σ w Jᵀr of every grid point, (2n, k): half the gradient of Σ r²."""
         k = self.config.features
-        gradient = torch.zeros(2 * self.config.points, k)
-        for batch in samples:
+        gradient = self.table.new_zeros(2 * self.config.points, k)
+        for batch in batches:
             psi = self.gather(batch).detach().requires_grad_()
             residual = loss.residual(torch.expm1(self.decode(psi).clamp_max(16.0)), batch)
             pull = torch.autograd.grad((0.5 * residual * residual).sum(), psi)[0].view(-1, k)
@@ -295,7 +334,11 @@ class NeuBRDF(nn.Module):
             tensors[f"weight{number}"] = layer.weight.detach().half().numpy()
             tensors[f"bias{number}"] = layer.bias.detach().half().numpy()
         config = dataclasses.asdict(self.config)
-        return tensors, {"kind": "neubrdf", "version": VERSION, "config": {**config, "hidden": list(self.config.hidden)}}
+        return tensors, {
+            "kind": "neubrdf",
+            "version": VERSION,
+            "config": {**config, "hidden": list(self.config.hidden)},
+        }
 
     def statistics(self) -> dict:
         """Return what a person wants to know of the result: the share of primitives in use."""
@@ -306,3 +349,18 @@ class NeuBRDF(nn.Module):
 def build(config: NeuBRDFConfig, seed: int) -> NeuBRDF:
     """Return the untrained model."""
     return NeuBRDF(config, seed)
+
+
+def from_asset(tensors: dict[str, np.ndarray], config: dict) -> NeuBRDF:
+    """Return the model that an asset's ``tensors`` and ``config`` hold, with its fp16 values."""
+    model = NeuBRDF(NeuBRDFConfig(**config))
+    with torch.no_grad():
+        model.codebook.copy_(torch.from_numpy(tensors["codebook"].astype(np.float32)))
+        model.indices.copy_(
+            torch.from_numpy(unpack_bits(tensors["indices"], model.config.bits, 2 * model.config.points))
+        )
+        model.quantised.fill_(True)
+        for number, layer in enumerate(model.layers):
+            layer.weight.copy_(torch.from_numpy(tensors[f"weight{number}"].astype(np.float32)))
+            layer.bias.copy_(torch.from_numpy(tensors[f"bias{number}"].astype(np.float32)))
+    return model

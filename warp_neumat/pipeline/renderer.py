@@ -1,6 +1,6 @@
 """Renders mesh sequences with fitted materials, shading in texture space and reusing it over frames (MobileVR §4.2).
 
-A frame passes the stages ``mesh`` (animation and upload), ``visibility`` (camera raster), ``mark`` (which texels the picture
+A frame passes the stages ``pose`` (animation and upload), ``visibility`` (camera raster), ``mark`` (which texels the picture
 will read), ``list`` (compaction into 2×2 quads by material), ``shade``, and ``gather`` (the picture from the radiance
 texture). With interval N, every (N + 1)th frame starts a new epoch, in which all that is seen is shaded anew; the N
 frames after it only shade what they see and the epoch has not shaded yet, so what comes into view is never a hole.
@@ -21,7 +21,7 @@ from warp_neumat.pipeline.atlas import Atlas
 from warp_neumat.pipeline.camera import CameraPath, load_camera
 from warp_neumat.pipeline.lights import PointLights, lights_from
 from warp_neumat.pipeline.sequence import MeshSequence
-from warp_neumat.pipeline.surface_mesh import SurfaceMesh, bind_materials
+from warp_neumat.pipeline.surface_mesh import SurfaceMesh, bind_materials, open_materials
 from warp_neumat.pipeline.texel_shader import TexelShader
 
 SKIPS = ("unowned", "backfacing", "unseen")
@@ -111,7 +111,8 @@ class Renderer:
             raise ValueError(f"skip must be among {', '.join(SKIPS)}, got {', '.join(sorted(self.skip - set(SKIPS)))}")
         self.device, self.space, self.interval = wp.get_device(device), space, interval
         self.sequence = sequence if isinstance(sequence, MeshSequence) else MeshSequence.load(sequence)
-        self.materials, face_material = bind_materials(self.sequence, materials, device=self.device)
+        self.assigned = open_materials(materials, device=self.device)
+        self.materials, face_material = bind_materials(self.sequence, self.assigned)
         self.width, self.height = int(size[0]), int(size[1])
         frame_count = frame_count or self.sequence.frame_count
         lo, hi = self.sequence.bounds()
@@ -198,6 +199,19 @@ class Renderer:
     def _shader(self, triangle, barycentric, material) -> TexelShader:
         return TexelShader(self.mesh, self.materials, triangle, barycentric, material, len(self.lights))
 
+    def per_pixel(self) -> "Renderer":
+        """Return a renderer of the same shot that shades every pixel of every frame: the reference for this one."""
+        return Renderer(
+            self.sequence,
+            self.assigned,
+            space="screen",
+            size=(self.width, self.height),
+            camera=self.camera,
+            lights=self.lights,
+            background=self.background,
+            device=self.device,
+        )
+
     def render(self, frames: Iterable[int] | None = None) -> Iterator[RenderedFrame]:
         """Yield the pictures of ``frames`` (default: the whole sequence), in order.
 
@@ -212,7 +226,7 @@ class Renderer:
         clock = _Clock(self.device)
         camera = self.camera.at(index)
         self.mesh.pose(index)
-        clock.stage("mesh")
+        clock.stage("pose")
         self.raster.run(self.mesh.points, camera.clip())
         clock.stage("visibility")
         updated = self.space == "screen" or self._since == 0

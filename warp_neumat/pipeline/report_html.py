@@ -34,7 +34,8 @@ svg .label { font-size: 12px; fill: var(--ink); } svg .peak { fill: var(--ink); 
 table { border-collapse: collapse; width: 100%; font-variant-numeric: tabular-nums; }
 th, td { padding: 3px 8px; border-bottom: 1px solid var(--rule); text-align: right; font-weight: 400; }
 th:first-child, td:first-child { text-align: left; } thead th { color: var(--dim); font-size: 13px; }
-td { white-space: nowrap; } td.meter { width: 30%; } .meter i { display: block; height: 10px; border-radius: 3px; background: var(--mark); }
+td { white-space: nowrap; } td.meter { width: 30%; }
+.meter i { display: block; height: 10px; border-radius: 3px; background: var(--mark); }
 details { margin: 8px 0; } details td { text-align: left; white-space: normal; overflow-wrap: anywhere; }
 """
 

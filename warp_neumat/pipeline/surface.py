@@ -15,6 +15,7 @@ import numpy as np
 
 AUTHORED, SMOOTH, FLAT = 0, 1, 2
 _TINY = np.float32(1e-30)  # squared length in units of the mesh's extent, below which an edge or area is zero
+_WELD_CELLS = 1 << 20  # per extent
 _CANCELLED = np.float32(1e-12)  # squared length of a sum of unit vectors, below which its direction is rounding
 
 
@@ -24,8 +25,8 @@ class Surface:
     Args:
         faces: (F, 3) int32. The corners of flat vertices belong to one face only.
         uv: (V, 2) float32 with its origin top left, NaN where there is none.
-        rest: Positions (V, 3) that decide which vertices are welded; equal positions of one weld group share a
-            smooth normal, even if a later frame parts them.
+        rest: Positions (V, 3) that decide which vertices are welded: those of one group that agree to a millionth of
+            the mesh's extent share a smooth normal, even if a later frame parts them.
         source: (V,) uint8, where the normal of a vertex comes from: AUTHORED, SMOOTH or FLAT.
         authored_tangents: (V,) bool, whether `complete` is given a tangent for the vertex.
         group: (V,) int32, vertices are welded within a group only.
@@ -41,15 +42,16 @@ class Surface:
         self._authored = source == AUTHORED
         self._smooth = np.flatnonzero(source == SMOOTH)
         self._weld = np.arange(count)
+        cell = np.rint((rest - rest.min(axis=0)).astype(np.float64) * (self._scale * _WELD_CELLS)).astype(np.int32)
         if len(self._smooth):
-            self._weld = _weld(self._smooth, count, group, rest)
+            self._weld = _weld(self._smooth, count, group, cell)
         self._authored_tangents = authored_tangents
         self._needs_uv_tangents = not authored_tangents.all()
-        self._prepare_tangents(uv, group, rest)
+        self._prepare_tangents(uv, group, cell)
 
-    def _prepare_tangents(self, uv, group, rest) -> None:
+    def _prepare_tangents(self, uv, group, cell) -> None:
         """Keep per face the weights of its two edges in dP/du, and per vertex its handedness; neither ever changes."""
-        faces, count = self._faces, len(rest)
+        faces, count = self._faces, len(cell)
         a, b, c = (uv[faces[:, k]].astype(np.float64) for k in range(3))
         (du1, dv1), (du2, dv2) = (b - a).T, (c - a).T
         area = du1 * dv2 - du2 * dv1
@@ -61,7 +63,7 @@ class Surface:
         self._handedness = np.where(side > 0.0, -1.0, 1.0).astype(np.float32)  # v counts down, so P_u × P_v is inward
         self._tangent_weld = np.arange(count)
         if len(self._smooth) and self._needs_uv_tangents:
-            self._tangent_weld = _weld(self._smooth, count, group, rest, uv, self._handedness)
+            self._tangent_weld = _weld(self._smooth, count, group, cell, uv, self._handedness)
 
     def complete(self, points, normals, tangents) -> tuple[np.ndarray, np.ndarray]:
         """Return unit normals and tangents of one frame.

@@ -10,35 +10,37 @@ from warp_neumat.pipeline.sequence import MeshSequence
 _FACES_PER_BLOCK = 4096
 
 
-def bind_materials(sequence: MeshSequence, assignments: dict, *, device=None) -> tuple[list[Material], np.ndarray]:
+def open_materials(assignments: dict, *, device=None) -> dict[str, Material]:
+    """Return ``assignments`` (name or glob → :class:`Material` or path) with each asset opened, once."""
+    opened: dict[str, Material] = {}
+    for value in assignments.values():
+        if not isinstance(value, Material) and str(value) not in opened:
+            opened[str(value)] = load(value, device=device)
+    return {k: v if isinstance(v, Material) else opened[str(v)] for k, v in assignments.items()}
+
+
+def bind_materials(sequence: MeshSequence, assignments: dict[str, Material]) -> tuple[list[Material], np.ndarray]:
     """Return the materials in use and the index of each face's.
 
     Args:
         sequence: Whose parts are named.
-        assignments: Name or glob of meshes, nodes or materials → :class:`Material` or path of an asset. A later entry
-            wins over an earlier one.
-        device: Warp device for assets that are opened here.
+        assignments: Name or glob of meshes, nodes or materials → material; a later entry wins over an earlier one.
 
     Returns: Materials, and (F,) int32.
     Raises:
         ValueError: If a name matches nothing, a part is left without material, or there are more than 254 materials.
     """
+    listed = list(dict.fromkeys(assignments.values()))
     chosen = np.full(len(sequence.mesh_names), -1, np.int32)
-    opened: dict = {}
     for pattern, material in assignments.items():
-        parts = sequence.select(pattern)
-        key = id(material) if isinstance(material, Material) else str(material)
-        opened.setdefault(key, (len(opened), material))
-        chosen[parts] = opened[key][0]
+        chosen[sequence.select(pattern)] = listed.index(material)
     if (chosen < 0).any():
         missing = ", ".join(repr(sequence.mesh_names[k]) for k in np.flatnonzero(chosen < 0)[:8])
         raise ValueError(f"{sequence.name}: no material for {missing}; name one, or cover the rest with '*'")
     used = np.unique(chosen)
     if len(used) > 254:
         raise ValueError(f"{sequence.name}: at most 254 materials can be in use, got {len(used)}; merge some")
-    listed = [m for _, m in sorted(opened.values(), key=lambda pair: pair[0])]
-    materials = [m if isinstance(m, Material) else load(m, device=device) for m in (listed[k] for k in used)]
-    return materials, np.searchsorted(used, chosen)[sequence.face_mesh].astype(np.int32)
+    return [listed[k] for k in used], np.searchsorted(used, chosen)[sequence.face_mesh].astype(np.int32)
 
 
 class SurfaceMesh:

@@ -22,7 +22,7 @@ BORDER = 2  # texels around xatlas' sheet, which places charts flush with its ed
 
 _INSET = 0.5 + 1 / 32  # where a chart starts in its rectangle: its footprint, 1/64 wider than bilinear, stays inside
 _ROUNDS = 12
-_PATCH = 2000  # xatlas' time grows faster than its input: 69k triangles take 6 times longer in one piece
+_PATCH = 2000  # xatlas' time grows faster than its input: 69k triangles in one piece take over 5 times longer
 
 
 class UnwrapError(RuntimeError):

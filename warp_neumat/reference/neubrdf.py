@@ -1,8 +1,8 @@
 """NumPy float64 evaluation of a NeuBRDF asset: the plain form that the torch module and the Warp kernel must match.
 
 Paper [neubrdf], Sec. 3.1–3.3 (Eq. 1–3). Differs: bilinear instead of inverse-distance (training) and 1/4 (runtime)
-weights; ω_o has an index grid of its own with northern numbering instead of the mirrored southern hemisphere; the decoder
-predicts log(1 + f). Frames: ω_i to the light, ω_o to the viewer, z = shading normal.
+weights; ω_o has an index grid of its own with northern numbering instead of the mirrored southern hemisphere; the
+decoder predicts log(1 + f). Frames: ω_i to the light, ω_o to the viewer, z = shading normal.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from warp_neumat.reference import healpix
 def to_local_frame(wi: np.ndarray, wo: np.ndarray, frame: str) -> tuple[np.ndarray, np.ndarray]:
     """Return the directions as the grids see them.
 
-    ``"absolute"`` returns them unchanged. ``"isotropic"`` turns both about z until ω_o has azimuth 0, then mirrors ω_i to
-    y ≥ 0; where ω_o is the pole (x² + y² < 1e-12) nothing is turned.
+    ``"absolute"`` returns them unchanged. ``"isotropic"`` turns both about z until ω_o has azimuth 0, then mirrors ω_i
+    to y ≥ 0; where ω_o is the pole (x² + y² < 1e-12) nothing is turned.
     """
     wi, wo = np.array(wi, np.float64), np.array(wo, np.float64)
     if frame == "absolute":

@@ -1,7 +1,7 @@
 """Where a fit looks at its source: directions drawn from a mixture that covers what pictures show.
 
-A BRDF is nearly constant over most of its domain and rises by orders of magnitude within a degree of the mirror direction,
-so uniform directions alone would hardly ever see a highlight. Three strategies share every batch:
+A BRDF is nearly constant over most of its domain and rises by orders of magnitude within a degree of the mirror
+direction, so uniform directions alone would hardly ever see a highlight. Three strategies share every batch:
 
 - both directions uniform in the projected hemisphere (what an evenly lit picture shows),
 - ω_o likewise and ω_i mirrored about a half vector at angle θ_h = (π/2)·u², u uniform: MERL's own spacing,
@@ -28,7 +28,7 @@ def _projected(count, rng, power=0.5):
 
 
 def _mirrored(wo, rng):
-    """Reflect ω_o about half vectors with θ_h = (π/2)·u²; what falls below the horizon is drawn again, then dropped up."""
+    """Reflect ω_o about half vectors with θ_h = (π/2)·u²; what falls below the horizon is drawn again."""
     wi = np.empty_like(wo)
     todo = np.arange(len(wo))
     for _ in range(8):
@@ -80,3 +80,19 @@ class BRDFSampler:
         """Return ``{"wi", "wo", "value"}``, each (count, 3) float32; value in 1/sr without the cosine."""
         wi, wo = self.directions(count)
         return {"wi": wi, "wo": wo, "value": self.source.eval(wi, wo)}
+
+
+def measured_directions(count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Return unit ω_i and ω_o spaced as a MERL table is, those below the horizon left out: (≤ count, 3) float32 each.
+
+    Uniform in √θ_h, θ_d and φ_d (Rusinkiewicz); Matusik et al. 2003.
+    """
+    u, theta_d, phi_d, phi = rng.random((4, count)) * np.array([[1.0], [np.pi / 2], [np.pi], [2 * np.pi]])
+    theta_h = np.pi / 2 * u * u
+    d = _polar(np.cos(theta_d), phi_d)
+    x, z = d[:, 0] * np.cos(theta_h) + d[:, 2] * np.sin(theta_h), d[:, 2] * np.cos(theta_h) - d[:, 0] * np.sin(theta_h)
+    wi = np.stack([x * np.cos(phi) - d[:, 1] * np.sin(phi), x * np.sin(phi) + d[:, 1] * np.cos(phi), z], 1)
+    half = _polar(np.cos(theta_h), phi)
+    wo = 2.0 * (wi * half).sum(1, keepdims=True) * half - wi
+    above = (wi[:, 2] > 1e-3) & (wo[:, 2] > 1e-3)
+    return wi[above].astype(np.float32), wo[above].astype(np.float32)

@@ -16,7 +16,7 @@ LIGHTS = (
 
 
 def sphere_pixels(size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return (mask (size, size) bool, normals (n, 3) float64 of the covered pixels in row order); y up, z to the viewer."""
+    """Return (mask (size, size) bool, normals (n, 3) float64 of covered pixels in row order); y up, z to the viewer."""
     axis = (np.arange(size) + 0.5) / size * 2.0 - 1.0
     x, y = np.meshgrid(axis, -axis)
     square = 1.0 - x * x - y * y
@@ -50,7 +50,9 @@ def render_sphere(eval_fn, size: int = 256, lights=LIGHTS) -> np.ndarray:
 def tone_map(image: np.ndarray) -> np.ndarray:
     """Return ``image`` as shown: clipped to [0, 1] and sRGB-encoded (IEC 61966-2-1)."""
     x = np.clip(image, 0.0, 1.0)
-    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.power(np.maximum(x, 1e-9), 1 / 2.4) - 0.055).astype(np.float32)
+    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.power(np.maximum(x, 1e-9), 1 / 2.4) - 0.055).astype(
+        np.float32
+    )
 
 
 def sphere_error(image: np.ndarray, reference: np.ndarray) -> dict[str, float]:

@@ -1,0 +1,143 @@
+"""A whole shot on disk: frames, video, reference and report."""
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from warp_neumat import machine, metrics
+from warp_neumat.io.image import write_exr, write_png
+from warp_neumat.io.video import VideoWriter
+from warp_neumat.pipeline.renderer import Renderer
+from warp_neumat.pipeline.report import write_report
+from warp_neumat.pipeline.tonemap import tonemap
+
+
+def render_shot(
+    renderer: Renderer,
+    out,
+    frames: range,
+    *,
+    reference: Renderer | None = None,
+    exposure: float = 0.0,
+    operator: str = "srgb",
+    exr: bool = False,
+    video: bool = False,
+    options: dict | None = None,
+    setup: dict | None = None,
+    progress: Callable[[float, str], None] | None = None,
+) -> dict:
+    """Render ``frames`` into the folder ``out`` and return the report.
+
+    Written are ``frames/NNNN.png``, with ``exr`` also ``frames/NNNN.exr`` (linear, float16), with ``video``
+    ``video.mp4``, ``report.json`` and ``report.html``; with ``reference`` also ``reference/NNNN.png``.
+
+    Args:
+        renderer: What renders.
+        out: Folder, made where it is missing.
+        frames: Frame numbers.
+        reference: Renders the same frames in screen space; the error of each frame is measured against it on the
+            tone-mapped pictures: PSNR, SSIM, FLIP.
+        exposure: Gain before tone mapping [stops].
+        operator: Tone mapping, as :func:`tonemap` names it.
+        options: What the report says was asked for.
+        setup: Milliseconds of what came before the first frame, by name, for the report.
+        progress: Called as ``progress(fraction, text)``.
+
+    Raises:
+        OSError: If the folder cannot be made or written.
+        ImportError: If ``video`` or ``reference`` needs an extra that is not installed; nothing is rendered then.
+        ValueError: If there is no frame.
+    """
+    if not len(frames):
+        raise ValueError("there is no frame to render; give a range A:B with B above A")
+    out = Path(out)
+    (out / "frames").mkdir(parents=True, exist_ok=True)
+    if reference is not None:
+        (out / "reference").mkdir(exist_ok=True)
+        blank = np.zeros((16, 16, 3), np.float32)
+        metrics.ssim(blank, blank), metrics.flip(blank, blank + 0.5)  # a missing extra shows before the work
+    writer = VideoWriter(out / "video.mp4", renderer.width, renderer.height, renderer.sequence.fps) if video else None
+    entries, pictures = [], []
+
+    def shoot(add: Callable[[np.ndarray], None]) -> None:
+        for done, index in enumerate(frames):
+            if progress:
+                progress(done / len(frames), f"frame {index}")
+            frame = renderer.frame(index)
+            stats = frame.stats
+            clock = time.perf_counter()
+
+            def stage(name):
+                nonlocal clock
+                now = time.perf_counter()
+                stats["ms"][name] = 1e3 * (now - clock)  # noqa: B023  (called within the iteration)
+                clock = now
+
+            display = tonemap(frame.image, exposure, operator)
+            stage("tonemap")
+            path = out / "frames" / f"{index:04d}.png"
+            write_png(path, display)
+            if exr:
+                write_exr(path.with_suffix(".exr"), frame.image)
+            stage("write")
+            add(display)
+            stage("video")
+            if reference is not None:
+                shaded = reference.frame(index)
+                stats["ms"]["reference"] = sum(shaded.stats["ms"].values())
+                stats["reference"] = {"shade_ms": shaded.stats["ms"]["shade"]}
+                stats["reference"]["evaluations"] = shaded.stats["evaluations"]
+                clock = time.perf_counter()
+                expected = tonemap(shaded.image, exposure, operator)
+                write_png(out / "reference" / f"{index:04d}.png", expected)
+                stats["error"] = {
+                    "psnr": metrics.psnr(expected, display),
+                    "ssim": metrics.ssim(expected, display),
+                    "flip": metrics.flip(expected, display)[0],
+                }
+                stage("metrics")
+            if writer is None:
+                del stats["ms"]["video"]
+            entries.append({"index": index, **stats})
+            pictures.append(path)
+
+    if writer is None:
+        shoot(lambda display: None)
+    else:
+        with writer:
+            shoot(writer.add)
+    if progress:
+        progress(1.0, "report")
+    report = {
+        "options": {"exposure": exposure, "tonemap": operator, **(options or {})},
+        "machine": machine.machine(),
+        "versions": machine.versions(),
+        "setup_ms": setup or {},
+        "frames": entries,
+        "summary": _summary(renderer, entries),
+    }
+    return write_report(out, report, frames=pictures)
+
+
+def _summary(renderer: Renderer, entries: list[dict]) -> dict:
+    """Return what the report's own summary does not know: the atlas, and the gain over the reference."""
+    summary: dict = {}
+    if renderer.atlas is not None:
+        atlas = renderer.atlas
+        summary["atlas"] = {
+            "resolution": atlas.resolution,
+            "utilisation": atlas.utilisation,
+            "charts": atlas.chart_count,
+            "sources": atlas.sources,
+            "notes": atlas.notes,
+        }
+    if "reference" in entries[0]:
+        ours = sum(e["ms"]["shade"] for e in entries)
+        summary["reference_shade_ms"] = sum(e["reference"]["shade_ms"] for e in entries) / len(entries)
+        summary["shade_speedup"] = summary["reference_shade_ms"] * len(entries) / ours if ours else None
+        summary["reference_evaluations"] = sum(e["reference"]["evaluations"] for e in entries) / len(entries)
+    if renderer.sequence.degenerate_faces:
+        summary["degenerate_faces"] = renderer.sequence.degenerate_faces
+    return summary

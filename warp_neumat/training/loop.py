@@ -1,0 +1,225 @@
+"""The training loop: stages, learning rates, checkpoints and progress. Knows no model by name.
+
+Every random draw is a function of (seed, what it is for, its number), never of what was drawn before: the same seed
+gives the same tensors, and a run resumed from a checkpoint goes on exactly as if it had never stopped.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+
+from warp_neumat.io.asset import FormatError
+from warp_neumat.io.atomic import replacing
+
+CHUNK = 16
+"""Batches that are drawn at once, and gone through :data:`PASSES` times before the next are drawn."""
+
+PASSES = 2
+EVENT_BATCH = 16384
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """How long and how a fit trains."""
+
+    steps: int
+    """Optimiser steps over all stages."""
+    batch: int = 8192
+    """Samples a step."""
+    seed: int = 0
+    """Decides every random draw."""
+    budget_seconds: float | None = None
+    """Where given, the stages share this time instead of ``steps``; the result then depends on the machine's speed."""
+    checkpoint_seconds: float = 20.0
+    """Longest stretch of work that an interruption can cost."""
+
+
+class Trainer:
+    """Trains a model of :mod:`warp_neumat.models` on what a sampler draws.
+
+    Args:
+        model: See the protocol in :mod:`warp_neumat.models`.
+        sampler: ``sampler(rng, count)`` returns a dict of (count, 3) float32 arrays with at least ``wi``.
+        loss: See :mod:`warp_neumat.training.losses`.
+        plan: Length and seed.
+        checkpoint: File to save progress to, or None.
+        identity: JSON-able facts that a checkpoint must share with the run that resumes it.
+        progress: ``progress(fraction, text)``, called several times a second at most.
+    """
+
+    def __init__(self, model, sampler, loss, plan: Plan, *, checkpoint=None, identity=None, progress=None):
+        self.model, self.sampler, self.loss, self.plan = model, sampler, loss, plan
+        self.checkpoint = None if checkpoint is None else Path(checkpoint)
+        self.identity = identity or {}
+        self.progress = progress or (lambda fraction, text: None)
+        self.device = next(model.parameters()).device
+        self.stages = model.stages()
+        self._stage = self._step = self._event = 0
+        self._elapsed = {"total": 0.0, "stage": 0.0}
+        self._pending = None  # optimiser state of a checkpoint, until its stage begins
+        self.last_loss = math.nan
+
+    # --- samples ---
+
+    def _prepared(self, count: int, *key: int) -> dict[str, torch.Tensor]:
+        samples = self.sampler(np.random.default_rng([self.plan.seed, *key]), count)
+        samples = {name: torch.from_numpy(array).to(self.device) for name, array in samples.items()}
+        return {**self.model.prepare(samples), **self.loss.target(samples)}
+
+    def _event_batches(self, number: int):
+        """Samples to take stock on: many times more than a training step sees."""
+        wanted, part = self.model.event_samples(), 0
+        while wanted > 0:
+            count = min(wanted, EVENT_BATCH)
+            yield self._prepared(count, 1, self._stage, number, part)
+            wanted, part = wanted - count, part + 1
+
+    # --- run ---
+
+    def run(self) -> dict:
+        """Train all stages that are left; return training facts: seconds, steps, seed, batch, loss."""
+        self._last_tick, self._last_save = time.monotonic(), time.monotonic()
+        total = 0
+        while self._stage < len(self.stages):
+            self._run_stage(self.stages[self._stage])
+            total += self._step
+            self._stage, self._step, self._event = self._stage + 1, 0, 0
+            self._elapsed["stage"] = 0.0
+        return {
+            "seconds": round(self._elapsed["total"], 2),
+            "steps": self.plan.steps if self.plan.budget_seconds is None else total,
+            "batch": self.plan.batch,
+            "seed": self.plan.seed,
+            "budget_seconds": self.plan.budget_seconds,
+            "loss": self.last_loss,
+        }
+
+    def _tick(self) -> None:
+        now = time.monotonic()
+        for key in self._elapsed:
+            self._elapsed[key] += now - self._last_tick
+        self._last_tick = now
+
+    def _position(self, stage: dict) -> float:
+        """How far the stage is, 0 … 1: by steps, or by time where there is a budget."""
+        if self.plan.budget_seconds is None:
+            return self._step / max(1, round(self.plan.steps * stage["share"]))
+        self._tick()
+        return self._elapsed["stage"] / (self.plan.budget_seconds * stage["share"])
+
+    def _report(self, stage: dict, text: str) -> None:
+        before = sum(s["share"] for s in self.stages[: self._stage])
+        self.progress(min(1.0, before + stage["share"] * min(1.0, self._position(stage))), text)
+
+    def _run_stage(self, stage: dict) -> None:
+        name = stage["name"]
+        if self._step == 0 and self._pending is None:
+            self._report(stage, f"{name}: preparing")
+            generator = torch.Generator().manual_seed(self.plan.seed * 1000 + self._stage)
+            self.model.begin(name, self._event_batches(0), self.loss, generator)
+        self.model.enter(name)
+        parameters = self.model.trainable(name)
+        optimiser = torch.optim.Adam(parameters, lr=stage["lr"][0], betas=(0.9, 0.99), eps=1e-10, fused=True)
+        if self._pending is not None:
+            self._restore_optimiser(optimiser, parameters)
+        chunk, order, length = None, None, CHUNK * self.plan.batch
+        while (position := self._position(stage)) < 1.0:
+            within = self._step % (CHUNK * PASSES)
+            if within == 0 or chunk is None:
+                self._between_chunks(stage, position, optimiser, parameters)
+                chunk = self._prepared(length, 0, self._stage, self._step // (CHUNK * PASSES))
+                order = None
+            if within % CHUNK == 0 and within:
+                draw = np.random.default_rng([self.plan.seed, 2, self._stage, self._step])
+                order = torch.from_numpy(draw.permutation(length)).to(self.device)
+                chunk = {key: value[order] for key, value in chunk.items()}
+            start = within % CHUNK * self.plan.batch
+            batch = {key: value[start : start + self.plan.batch] for key, value in chunk.items()}
+            high, low = stage["lr"]
+            optimiser.param_groups[0]["lr"] = low + (high - low) * 0.5 * (1.0 + math.cos(math.pi * position))
+            optimiser.zero_grad(set_to_none=True)
+            loss = self.loss(self.model.predict(batch), batch)
+            loss.backward()
+            optimiser.step()
+            self._step += 1
+            if within == CHUNK - 1:
+                self.last_loss = float(loss.detach())
+                if not math.isfinite(self.last_loss):
+                    raise FloatingPointError(f"the fit diverged in stage {name} at step {self._step}; try another seed")
+                self._report(stage, f"{name}: loss {self.last_loss:.4f}")
+        self.last_loss = float(loss.detach()) if chunk is not None else self.last_loss
+        self._tick()
+
+    def _between_chunks(self, stage, position, optimiser, parameters) -> None:
+        """Do what may happen only here: an event that is due, a checkpoint that is due."""
+        self._tick()
+        # The last quarter of a stage is free of events, to settle.
+        while self._event < stage["events"] and position >= 0.75 * self._event / stage["events"]:
+            self._event += 1
+            batches = list(self._event_batches(self._event))
+            self._report(stage, f"{stage['name']}: taking stock {self._event}/{stage['events']}")
+            self.model.event(stage["name"], batches, self.loss)
+        if self.checkpoint is not None and time.monotonic() - self._last_save >= self.plan.checkpoint_seconds:
+            self._tick()
+            self._save(optimiser, parameters)
+            self._last_save = time.monotonic()
+
+    # --- checkpoints ---
+
+    def _facts(self) -> dict:
+        return {"plan": dataclasses.asdict(self.plan), **self.identity}
+
+    def _save(self, optimiser, parameters) -> None:
+        tensors = {f"model.{name}": value.contiguous() for name, value in self.model.state_dict().items()}
+        for number, parameter in enumerate(parameters):
+            for key, value in optimiser.state.get(parameter, {}).items():
+                tensors[f"optimiser.{number}.{key}"] = value.contiguous()
+        state = {"stage": self._stage, "step": self._step, "event": self._event, "elapsed": self._elapsed}
+        metadata = {"state": json.dumps(state), "facts": json.dumps(self._facts(), sort_keys=True)}
+        with replacing(self.checkpoint) as temporary:
+            temporary.write_bytes(save(tensors, metadata=metadata))
+
+    def resume(self) -> bool:
+        """Load the checkpoint; return False if there is none.
+
+        Raises:
+            FormatError: If it is no checkpoint, or was made by a fit with other settings.
+        """
+        if self.checkpoint is None or not self.checkpoint.is_file():
+            return False
+        anew = "fit again without --resume"
+        try:
+            with safe_open(self.checkpoint, framework="pt") as file:
+                metadata = file.metadata() or {}
+                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            state, facts = json.loads(metadata["state"]), json.loads(metadata["facts"])
+        except (SafetensorError, KeyError, json.JSONDecodeError) as error:
+            raise FormatError(self.checkpoint, "file", f"no readable checkpoint ({error})", anew) from None
+        mine = json.loads(json.dumps(self._facts()))
+        for key in mine.keys() | facts.keys():
+            if mine.get(key) != facts.get(key):
+                rule = f"was {facts.get(key)!r} when it was saved, now {mine.get(key)!r}"
+                raise FormatError(self.checkpoint, key, rule, f"use the same settings, or {anew}")
+        model = {name.removeprefix("model."): value for name, value in tensors.items() if name.startswith("model.")}
+        self.model.load_state_dict(model)
+        self._stage, self._step, self._event = state["stage"], state["step"], state["event"]
+        self._elapsed = state["elapsed"]
+        self._pending = {name: value for name, value in tensors.items() if name.startswith("optimiser.")}
+        return True
+
+    def _restore_optimiser(self, optimiser, parameters) -> None:
+        for number, parameter in enumerate(parameters):
+            prefix = f"optimiser.{number}."
+            state = {k.removeprefix(prefix): v for k, v in self._pending.items() if k.startswith(prefix)}
+            if state:
+                optimiser.state[parameter] = state
+        self._pending = None
