@@ -47,12 +47,22 @@ def _progress(title: str):
         yield lambda fraction, text="": bar.update(task, completed=fraction, text=text)
 
 
-def _warp():
-    """Import Warp without its banner."""
+def _warp(device: str = "cpu"):
+    """Import Warp without its banner, and for the CPU without its warning that there is no GPU driver."""
     import warp as wp
 
-    wp.config.quiet = True
-    return wp
+    wp.config.log_level = wp.LOG_WARNING  # no banner, no line for each kernel module
+    if device == "cpu":
+        sys.stderr.flush()
+        saved, silent = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+        try:
+            os.dup2(silent, 2)  # the warning is written by native code
+            wp.init()
+        finally:
+            os.dup2(saved, 2)
+            os.close(saved)
+            os.close(silent)
+    wp.get_device(device)  # an unknown device is an error before any work
 
 
 def _frames(text: str | None, count: int) -> range:
@@ -102,7 +112,7 @@ def fit(
     device: Device = "cpu",
 ):
     """Fit a material to a reflectance function and store it as a .neumat asset."""
-    _warp()
+    _warp(device)
     from warp_neumat.training.fit import fit as run
 
     start = time.perf_counter()
@@ -237,7 +247,7 @@ def render(
         raise ValueError(f"--policy must be fixed or every, got {policy!r}")
     picture, assigned = _size(size), _assignments(material)
     skip, behind = parse_skips(no_skip or []), parse_background(background)
-    _warp()
+    _warp(device)
     from warp_neumat.pipeline.sequence import MeshSequence
 
     loaded = MeshSequence.load(sequence, animation=animation, fps=fps, normals=normals, double_sided=double_sided)
@@ -273,7 +283,7 @@ def demo(
 ):
     """Render the bundled animation with the bundled materials: frames, video, report.html, report.json."""
     picture = _size(size)
-    _warp()
+    _warp(device)
     from warp_neumat.pipeline import demo as bundled
     from warp_neumat.pipeline.renderer import SKIPS
 

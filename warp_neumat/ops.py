@@ -38,3 +38,10 @@ def healpix_corners(nside: int, direction: torch.Tensor) -> tuple[torch.Tensor, 
 def _(nside, direction):
     shape = (direction.shape[0], 4)
     return direction.new_empty(shape, dtype=torch.int32), direction.new_empty(shape, dtype=torch.float32)
+
+
+def _no_gradient(ctx, inputs, output):
+    ctx.mark_non_differentiable(*output)
+
+
+healpix_corners.register_autograd(lambda ctx, *gradients: (None, None), setup_context=_no_gradient)

@@ -123,6 +123,8 @@ def _break(name):
     points = tree["accessors"][primitive["attributes"]["POSITION"]]
     if name == "out of buffer":
         points["count"] = 50
+    elif name == "view out of buffer":
+        points["count"], tree["bufferViews"][0]["byteLength"] = 50, 6000
     elif name == "face index":
         primitive["indices"] = file.add([0, 1, 7], "SCALAR", np.uint16)
     elif name == "nan":
@@ -158,6 +160,7 @@ def _break(name):
     ("name", "message"),
     [
         ("out of buffer", r"accessor 0 reaches out of its buffer: it ends at byte 600, bufferView 0 ends at 60"),
+        ("view out of buffer", r"accessor 0 reaches out of .*, bufferView 0 ends at 6000, the buffer at 68"),
         ("face index", r"mesh 0 \(unnamed\), primitive 0: face 0 has index 7, but there are 5 vertices"),
         ("nan", r"3 of 5 vertices are NaN or Inf"),
         ("draco", r"requires the unsupported extension KHR_draco_mesh_compression; export the file without it"),

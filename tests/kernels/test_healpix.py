@@ -101,7 +101,7 @@ def test_vec2pix_ignores_length(device, rng):
 # ---------------------------------------------------------------------------------------------- vec2pix, float32
 
 BORDER32 = 3.5 * 2.0**-24
-"""[pixel / nside] Worst seen 1.72 · 2⁻²⁴ on 400 000 random directions per nside, AVX2, 2026-11; twice that."""
+"""[pixel / nside] Worst seen 1.82 · 2⁻²⁴ on random directions and pixel borders, AVX2, 2026-11; about twice that."""
 
 
 @pytest.mark.parametrize("nside", [1, 2, 4, 7, 64, 100, 1024, 8192])
@@ -116,18 +116,7 @@ def test_vec2pix_float32_errs_only_at_borders(device, rng, nside):
         wrong = found != expected
         assert distance[wrong].max(initial=0.0) <= BORDER32 * nside
         neighbours = healpy.get_all_neighbours(nside, expected[wrong], nest=nest)
-        beside = (neighbours == found[wrong]).any(axis=0)
-        # Where three pixels meet at a cap's corner, or at the poles, healpy lists no pixel across the point.
-        assert (beside | touches(nside, found[wrong], exact[wrong], nest)).all()
-
-
-def touches(nside: int, pixels: np.ndarray, vec: np.ndarray, nest: bool) -> np.ndarray:
-    """Whether each direction lies within rounding of a corner of its pixel."""
-    if not len(pixels):
-        return np.zeros(0, bool)
-    corners = healpy.boundaries(nside, pixels, step=1, nest=nest)
-    far = np.linalg.norm(corners - (vec / np.linalg.norm(vec, axis=1, keepdims=True))[:, :, None], axis=1)
-    return far.min(axis=1) < 1e-6
+        assert (neighbours == found[wrong]).any(axis=0).all()
 
 
 def test_vec2pix_precision_can_be_forced(rng):

@@ -282,6 +282,18 @@ def test_bad_frames_are_named():
         raster.run(np.zeros((3, 3), np.float32), np.full((4, 4), np.nan))
 
 
+def test_stats_count_what_was_skipped():
+    points = np.array([[-1, -1, -9], [1, -1, -9], [0, 1, -9], [0, 0, 5], [np.nan, 0, -9]], np.float32)
+    faces = np.array([[0, 1, 2], [0, 2, 1], [0, 1, 1], [0, 1, 4], [3, 3, 3]])  # seen, back, flat, NaN, behind the eye
+    raster = CameraRaster(faces, 5, 640, 64, device="cpu")
+    raster.run(points, perspective(640, 64))
+    stats = raster.stats()
+    assert (stats["triangles"], stats["tiles"], stats["tiles_drawn"]) == (5, 10, 2)
+    assert 1 <= stats["kept"] <= 2  # the flat one is found out when it is drawn
+    raster.run(points + np.float32([0, 0, 20]), perspective(640, 64))
+    assert raster.stats() == {"triangles": 5, "tiles": 10, "kept": 0, "entries": 0, "tiles_drawn": 0}
+
+
 def test_mesh_without_triangles_draws_background():
     triangle, _, depth = draw(np.zeros((3, 3), np.float32), np.zeros((0, 3), np.int32), perspective(9, 9), 9, 9)
     assert (triangle == -1).all()

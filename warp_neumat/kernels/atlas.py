@@ -154,7 +154,7 @@ def atlas_raster_kernel(
 
 
 @wp.kernel
-def atlas_overlap_kernel(
+def atlas_folds_kernel(
     first: int,
     corners: wp.array(dtype=wp.vec2),
     chart: wp.array(dtype=wp.int32),
@@ -167,7 +167,6 @@ def atlas_overlap_kernel(
     # outputs
     last: wp.array2d(dtype=wp.int32),
     folded: wp.array(dtype=wp.uint8),
-    covered: wp.array(dtype=wp.uint8),
 ):
     t = first + wp.tid()
     x0 = (t % columns) * tile
@@ -201,8 +200,6 @@ def atlas_overlap_kernel(
                     # Members come chart by chart, so the chart seen last is enough to tell a fold from a neighbour.
                     if last[y, x] == chart[f]:
                         folded[f] = wp.uint8(1)
-                    elif last[y, x] >= 0:
-                        covered[f] = wp.uint8(1)
                     last[y, x] = chart[f]
 
 
@@ -347,12 +344,12 @@ def atlas_raster(corner_uv, chart, width: int, height: int, *, dilation: int = 2
     return kind.give(triangle), kind.give(barycentric)
 
 
-def atlas_overlap(corner_uv, chart, width: int, height: int, *, device=None):
-    """Return which triangles lie on others: ``(folded, covered)``, numpy bool arrays of shape [faces].
+def atlas_folds(corner_uv, chart, width: int, height: int, *, device=None):
+    """Return which triangles lie on others of their chart (numpy bool, shape [faces]).
 
-    ``folded``: a texel centre is strictly inside this triangle and another one of the same chart; ``covered``: of
-    another chart. Shared edges do not count. At least one triangle of every overlapping pair is marked. Arguments as
-    for :func:`atlas_raster`; overlaps between texel centres are not seen, so use a sheet of 1024² or more.
+    A texel centre is then strictly inside two triangles; shared edges do not count, and of the triangles that hold a
+    centre the lowest is not marked. Arguments as for :func:`atlas_raster`; what overlaps between texel centres is not
+    seen, so use a sheet of 1024² or more.
     """
     _check_size(width, height)
     kind = kind_of(corner_uv, device)
@@ -361,16 +358,16 @@ def atlas_overlap(corner_uv, chart, width: int, height: int, *, device=None):
     order = np.argsort(host, kind="stable")
     offsets, members = _tile_lists(corners, drawable(corners, host), order, 0.0, tile, width, height)
     place = functools.partial(wp.array, dtype=wp.int32, device=kind.device)
-    folded, covered = (wp.zeros(len(corners), dtype=wp.uint8, device=kind.device) for _ in range(2))
+    folded = wp.zeros(len(corners), dtype=wp.uint8, device=kind.device)
     last = wp.empty((height, width), dtype=wp.int32, device=kind.device)
     launch(
-        atlas_overlap_kernel,
+        atlas_folds_kernel,
         len(offsets) - 1,
         inputs=[flat, charts, place(offsets), place(members), tile, -(-width // tile), width, height],
-        outputs=[last, folded, covered],
+        outputs=[last, folded],
         device=kind.device,
     )
-    return folded.numpy().astype(bool), covered.numpy().astype(bool)
+    return folded.numpy().astype(bool)
 
 
 def atlas_leaks(corner_uv, chart, triangle, *, device=None) -> np.ndarray:

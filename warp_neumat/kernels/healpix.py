@@ -324,7 +324,7 @@ def vec2pix(nside: int, vec, *, nest: bool, precision: str = "auto", out=None, d
         TypeError: If ``nside`` is no whole number or ``vec`` holds no numbers.
 
     Error: float64 none against healpy, borders included, where both use the same libm (CPU); on CUDA the last bit of
-    atan2 may decide a border otherwise. float32 differs only within 1.8 nside 2⁻²⁴ of a border [pixel], by one pixel.
+    atan2 may decide a border otherwise. float32 differs only within 1.9 nside 2⁻²⁴ of a border [pixel], by one pixel.
     Held by test_vec2pix_equals_healpy_* and test_vec2pix_float32_errs_only_at_borders.
 
     Source: Górski et al. 2005, Eq. (2)–(9) and Sec. 5.3.

@@ -207,7 +207,7 @@ class CameraRaster:
         projected, bounds = array(self.vertex_count, wp.vec4d), array(n, wp.vec4s)
         mesh = [projected, self._faces, self._sided]
         size = [self.width, self.height]
-        self._near, self._last = None, None
+        self._clip = None
 
         L = lanes(self.device)
         points = array((self.vertex_count, 3), wp.float32)
@@ -286,11 +286,13 @@ class CameraRaster:
             job.run()
 
     def _prepare(self, points, clip) -> None:
-        near, far = depth_range(clip)
         points = take(points, "points", (self.vertex_count, 3), wp.float32, self._kind)
-        _set(self._project, points=points.flatten(), m=wp.mat44d(pixel_matrix(clip, self.width, self.height)))
-        if self._last != (near, far):
-            self._last = near, far
+        _set(self._project, points=points.flatten())
+        clip = np.asarray(clip, dtype=np.float64)
+        if self._clip is None or not np.array_equal(clip, self._clip):
+            near, far = depth_range(clip)
+            self._clip = clip.copy()
+            _set(self._project, m=wp.mat44d(pixel_matrix(clip, self.width, self.height)))
             ranges = {"q_near": float(np.float32(1.0 / near)), "q_far": float(np.float32(1.0 / far))}
             if self._tiled:
                 _set(self._count, near=near)
@@ -302,18 +304,19 @@ class CameraRaster:
             _set(self._tiles, scratch=wp.empty(self._slots * SCRATCH, dtype=wp.float32, device=self.device))
 
     def stats(self) -> dict[str, int]:
-        """Return counts of the last frame: triangles, those that may cover a pixel, and tiles, those with pixels drawn.
+        """Return counts of the last frame, so that what was skipped can be seen.
 
-        Only for tiled drawing; ``kept`` excludes back faces, degenerate triangles, and those outside or between pixels.
+        ``triangles`` of the mesh and ``tiles`` of the picture; where drawn tile by tile also ``kept``, the triangles
+        left without back faces, degenerate ones, and those outside or between pixel centres, ``entries`` of all
+        cells' lists, and ``tiles_drawn``, the tiles with a pixel that is not background.
         """
-        box = self._bounds.numpy()
-        return {
-            "triangles": self.triangle_count,
-            "kept": int((box[:, 0] <= box[:, 2]).sum()),
-            "entries": int(self._starts.numpy()[-1]),
-            "tiles": int(self._dirty.shape[0]),
-            "tiles_drawn": int(np.count_nonzero(self._dirty.numpy())),
-        }
+        counts = {"triangles": self.triangle_count, "tiles": blocks(self.width, TILE) * blocks(self.height, TILE)}
+        if self._tiled:
+            box = self._bounds.numpy()
+            counts["kept"] = int((box[:, 0] <= box[:, 2]).sum())
+            counts["entries"] = int(self._starts.numpy()[-1])
+            counts["tiles_drawn"] = int(np.count_nonzero(self._dirty.numpy()))
+        return counts
 
 
 def _coprime(n: int) -> int:

@@ -2,8 +2,8 @@
 
 Plain k-means treats all feature coordinates alike, though the decoder is deaf to some and alert to others, differently
 in each direction. With H_p = Σ w² JᵀJ, the Gauss-Newton matrix of the loss at grid point p (w the corner weight of a
-sample, J the decoder's derivative), replacing F_p alone by c costs about (c − F_p)ᵀ H_p (c − F_p). Assignment and update
-are closed forms: c = (Σ H_p)⁻¹ Σ H_p F_p over the points of a cell.
+sample, J the decoder's derivative), replacing F_p alone by c costs about (c − F_p)ᵀ H_p (c − F_p). Assignment and
+update are closed forms: c = (Σ H_p)⁻¹ Σ H_p F_p over the points of a cell.
 """
 
 from __future__ import annotations

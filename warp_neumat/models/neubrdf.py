@@ -225,8 +225,11 @@ class NeuBRDF(nn.Module):
 
         Error: see tests/models/test_neubrdf.py::test_forward_matches_float64.
         """
-        value = torch.expm1(self.decode(self.gather(self.prepare({"wi": wi, "wo": wo})))).clamp_min(0.0)
-        return torch.where((wi[:, 2:] > 0) & (wo[:, 2:] > 0), value, 0.0)
+        above = (wi[:, 2:] > 0) & (wo[:, 2:] > 0)
+        zenith = wi.new_tensor([0.0, 0.0, 1.0])  # stands in below the horizon, where the grids end
+        samples = {"wi": torch.where(above, wi, zenith), "wo": torch.where(above, wo, zenith)}
+        value = torch.expm1(self.decode(self.gather(self.prepare(samples)))).clamp_min(0.0)
+        return torch.where(above, value, 0.0)
 
     @torch.no_grad()
     def evaluate(self, wi: np.ndarray, wo: np.ndarray) -> np.ndarray:
@@ -276,7 +279,7 @@ class NeuBRDF(nn.Module):
 
         Points of one colour share no pixel, so with all others fixed each sees an exact least-squares problem of its
         own (but for the decoder's curvature). What one colour leaves over, the next takes into account: neighbours
-        learn to average to values that no primitive holds. Unused primitives move to the points that want to move most.
+        learn to average to values that no primitive holds.
         """
         metric = self.metric(batches, loss)
         words, points = self.codebook.detach(), self.config.points
@@ -290,13 +293,7 @@ class NeuBRDF(nn.Module):
             local = metric[live] + (_DAMPING * size[live])[:, None, None] * eye
             step = torch.linalg.solve(local, self.gradient(batches, loss)[live])
             target = words[self.indices[live]] - step
-            index, cost = vq.assign(target, local, words)
-            unused = torch.nonzero(torch.bincount(self.indices, minlength=len(words)) == 0).flatten()[: len(live) // 8]
-            if len(unused):
-                costly = cost.topk(len(unused)).indices
-                words[unused] = target[costly]
-                index[costly] = unused
-            self.indices[live] = index.int()
+            self.indices[live] = vq.assign(target, local, words)[0].int()
 
     def metric(self, batches, loss) -> torch.Tensor:
         """Return H = Σ w² JᵀJ of every grid point, (2n, k, k), J the derivative of the residuals by ψ, w the weight."""

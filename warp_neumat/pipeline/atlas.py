@@ -7,7 +7,7 @@ that chart, so a plain bilinear fetch reads neither another chart nor an unowned
 
 How a layout is found, best first:
 
-- ``authored``: the only part's own UVs, where they do not overlap and leave enough space between charts;
+- ``authored``: the only part's own UVs, where charts do not overlap and lie far enough apart;
 - ``repacked``: the part's own charts, placed anew together with those of other parts at one texel density;
 - ``xatlas``: charts made by xatlas, for parts without usable UVs;
 - ``fallback``: pairs of triangles as right triangles in square cells, where xatlas fails or runs out of time.
@@ -26,7 +26,7 @@ from pathlib import Path
 
 import numpy as np
 
-from warp_neumat.kernels.atlas import FOOTPRINT, atlas_leaks, atlas_overlap, atlas_raster
+from warp_neumat.kernels.atlas import FOOTPRINT, atlas_folds, atlas_leaks, atlas_raster
 from warp_neumat.pipeline.unwrap import (
     UnwrapError,
     connected,
@@ -121,14 +121,12 @@ class Atlas:
             raise ValueError(f"uv must be one of {', '.join(_MODES)}, got {uv!r}")
         if not time_limit > 0:
             raise ValueError(f"time_limit must be a positive number of seconds, got {time_limit}")
-        maker = _Maker(sequence, resolution, padding, uv, time_limit, progress, device)
         file = _cache_file(sequence, resolution, padding, uv, cache)
-        if file is not None:
-            layout = _read_layout(file, len(sequence.faces), time_limit)
-            raster = None if layout is None else maker.raster(layout)
-            if raster is not None:
-                return cls(resolution, layout.corner_uv, layout.chart, *raster, layout.sources, layout.notes)
-        layout, raster = maker.make()
+        layout = None if file is None else _read_layout(file, len(sequence.faces), time_limit)
+        raster = _raster(layout, resolution, padding, device)
+        if raster is not None:
+            return cls(resolution, layout.corner_uv, layout.chart, *raster, layout.sources, layout.notes)
+        layout, raster = _Maker(sequence, resolution, padding, uv, time_limit, progress, device).make()
         notes = list(layout.notes)
         if file is not None and layout.keep:
             try:
@@ -146,6 +144,15 @@ class _Layout:
     notes: list[str]
     timed_out: bool = False  # a longer limit may give a better layout
     keep: bool = True  # worth caching
+
+
+def _raster(layout: _Layout | None, resolution: int, padding: int, device):
+    """Return ``(triangle, barycentric)``, or ``None`` without a layout or if it does not hold the guarantee."""
+    if layout is None:
+        return None
+    rings = max(1, padding // 2)
+    raster = atlas_raster(layout.corner_uv, layout.chart, resolution, resolution, dilation=rings, device=device)
+    return None if atlas_leaks(layout.corner_uv, layout.chart, raster[0], device=device).any() else raster
 
 
 class _Maker:
@@ -183,7 +190,7 @@ class _Maker:
             raise ValueError(f"the UVs of {self.names[p]!r} cannot be kept: {reason}; use uv='auto' to unwrap it anew")
         if len(np.unique(self.part)) == 1 and not unusable:
             layout = self._keep(chart)
-            raster = None if layout is None else self.raster(layout)
+            raster = self._raster(layout)
             if raster is not None:
                 return layout, raster
         made = np.isin(self.part, list(unusable))
@@ -192,7 +199,7 @@ class _Maker:
         if self.mode != "fallback":
             try:
                 layout = self._xatlas(made, surface_uv, chart, notes)
-                raster = self.raster(layout)
+                raster = self._raster(layout)
                 if raster is not None:
                     return layout, raster
                 failure = UnwrapError("xatlas' charts overlap or lie too close")
@@ -202,18 +209,13 @@ class _Maker:
         layout = self._fallback(made, surface_uv, chart, notes)
         layout.timed_out = failure is not None and failure.timed_out
         layout.keep = failure is None or failure.timed_out  # a crash or a missing library may be mended: try again
-        raster = self.raster(layout)
+        raster = self._raster(layout)
         if raster is None:
             raise RuntimeError("the fallback layout breaks the footprint guarantee; please report this mesh")
         return layout, raster
 
-    def raster(self, layout: _Layout):
-        """Return ``(triangle, barycentric)``, or ``None`` if the layout does not hold the guarantee."""
-        size = self.resolution
-        rings = max(1, self.padding // 2)
-        raster = atlas_raster(layout.corner_uv, layout.chart, size, size, dilation=rings, device=self.device)
-        leaks = atlas_leaks(layout.corner_uv, layout.chart, raster[0], device=self.device)
-        return None if leaks.any() else raster
+    def _raster(self, layout):
+        return _raster(layout, self.resolution, self.padding, self.device)
 
     def _authored(self, mine, chart, surface_uv) -> str | None:
         """Find the charts of one part's own UVs and write them to ``chart`` and ``surface_uv``, or say why not."""
@@ -240,8 +242,8 @@ class _Maker:
         low = uv.min(axis=(0, 1))
         size = max(1024, self.resolution)
         on_test_sheet = ((self.uv[rows] - low) * (size / (uv.max(axis=(0, 1)) - low).max())).astype(np.float32)
-        folded, _ = atlas_overlap(on_test_sheet, charts, size, size, device=self.device)
-        if folded.any():
+        folded = atlas_folds(on_test_sheet, charts, size, size, device=self.device)
+        if self.area[rows[folded]].sum() > _LOST * area.sum():
             return f"{np.count_nonzero(folded)} of {len(mine)} triangles overlap others of their chart"
         chart[mine] = -1
         chart[rows] = charts + chart.max() + 1
@@ -249,7 +251,7 @@ class _Maker:
         return None
 
     def _keep(self, chart) -> _Layout | None:
-        """Return the only part's own layout, or ``None`` where it leaves [0, 1] or charts lie on each other."""
+        """Return the only part's own layout, or ``None`` where it leaves [0, 1]; the guarantee is for the caller to check."""
         uv = self.uv[chart >= 0]
         if uv.min() < -1e-3 or uv.max() > 1 + 1e-3:
             return None
@@ -258,11 +260,7 @@ class _Maker:
         if uv.min() * size < rim or uv.max() * size > size - rim:  # UVs up to the border: shrink by the rim
             low, high = min(uv.min(), 0.0), max(uv.max(), 1.0)
             corners = rim + (self.uv - low) * ((size - 2 * rim) / (high - low))
-        layout = self._layout(corners, chart, np.zeros(len(chart), bool), "authored", [])
-        test = max(1024, size)
-        scale = np.float32(test / size)
-        folded, covered = atlas_overlap(layout.corner_uv * scale, layout.chart, test, test, device=self.device)
-        return None if folded.any() or covered.any() else layout
+        return self._layout(corners, chart, np.zeros(len(chart), bool), "authored", [])
 
     def _xatlas(self, made, surface_uv, chart, notes) -> _Layout:
         """Return the layout of xatlas: new charts for the triangles ``made``, all charts packed."""

@@ -158,6 +158,23 @@ class OrbitPath(CameraPath):
         return Camera.look_at(eye, self.centre, near=near, far=far, **lens)
 
 
+_FILL = 0.9  # of the picture's width or height, by the default orbit
+
+
+def _fitting_distance(lo, hi, elevation: float, fill: float, aspect: float) -> float:
+    """The nearest distance at which the box lies within tan ``fill`` (× ``aspect``) of the axis, from all azimuths."""
+    half = 0.5 * (np.asarray(hi, np.float64) - np.asarray(lo, np.float64))
+    corners = half * np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, 8).T
+    angle = np.linspace(0.0, 2.0 * math.pi, 256, endpoint=False)
+    level, height = math.cos(elevation) * np.ones_like(angle), math.sin(elevation)
+    back = np.stack([level * np.sin(angle), height * np.ones_like(angle), level * np.cos(angle)], axis=1)
+    right = np.stack([np.cos(angle), np.zeros_like(angle), -np.sin(angle)], axis=1)
+    across, along = np.abs(right @ corners.T), back @ corners.T
+    upward = np.abs(np.cross(back, right) @ corners.T)
+    # A point is inside where across <= fill · aspect · (distance - along), and likewise upward.
+    return float((along + np.maximum(across / (fill * aspect), upward / fill)).max())
+
+
 def orbit(
     lo,
     hi,
@@ -182,7 +199,8 @@ def orbit(
         turns: Whole or broken turns, counterclockwise seen from above; negative ones go the other way.
         elevation: Angle above the horizon [rad], in (−π/2, π/2).
         azimuth: Where the path starts [rad].
-        distance: From the centre [scene unit]; by default the bounding sphere's outline fills 85 % of the shorter side.
+        distance: From the centre [scene unit]; by default the nearest from which the box, seen from any side, leaves a
+            tenth of the picture's width or height free.
         fov_y: Vertical field of view [rad].
     """
     centre, radius = bounding_sphere(lo, hi)
@@ -191,9 +209,7 @@ def orbit(
     if not abs(elevation) < 0.5 * math.pi * 0.9999:
         raise ValueError(f"elevation must be between -90 and 90 degrees, got {math.degrees(elevation):g}")
     if distance is None:
-        # A sphere's outline is the cone of half angle asin(r/d) around it, whose tangent is r / sqrt(d² − r²).
-        fill = 0.85 * math.tan(0.5 * fov_y) * min(1.0, width / height)
-        distance = radius * math.sqrt(1.0 + 1.0 / fill**2)
+        distance = _fitting_distance(lo, hi, elevation, _FILL * math.tan(0.5 * fov_y), width / height)
     if not 0 < distance < math.inf:
         raise ValueError(f"distance must be above 0, got {distance:g}")
     path = OrbitPath(centre, radius, distance, frames, turns, elevation, azimuth, fov_y, width, height)

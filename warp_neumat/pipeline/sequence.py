@@ -202,15 +202,14 @@ class MeshSequence:
         Raises: IndexError: If a folder or array sequence has no such frame.
         """
         key = self._key(index)
-        if key not in self._frames:
+        frame = self._frames.get(key)
+        if frame is None:
             points, normals, tangents = self._motion.full(key, self.fps)
             frame = Frame(points, *self._surface.complete(points, normals, tangents))
             for array in vars(frame).values():
                 array.flags.writeable = False
-            while len(self._frames) >= _KEPT_FRAMES:
-                self._frames.pop(next(iter(self._frames)))
-            self._frames[key] = frame
-        return self._frames[key]
+            self._frames = dict([*self._frames.items()][1 - _KEPT_FRAMES :]) | {key: frame}
+        return frame
 
     def _key(self, index: int) -> int:
         key = self._motion.key(int(index), self.frame_count)

@@ -270,14 +270,17 @@ def _parametrise(xatlas, points, faces, part):
     pack.texels_per_unit, pack.padding = 8.0, 0
     atlas.generate(xatlas.ChartOptions(), pack)
     uv, chart, count = np.zeros((len(faces), 3, 2)), np.full(len(faces), -1, np.int64), 0
+    sheet = [atlas.width, atlas.height]
     for mesh, row in enumerate(rows):
         _, index, where = atlas[mesh]
-        texels = where.astype(np.float64) * [atlas.width, atlas.height]
-        uv[row] = texels[index] * (unit / atlas.texels_per_unit)
+        uv[row] = (where.astype(np.float64) * sheet)[index]
         for i in range(atlas.get_mesh_chart_count(mesh)):
             chart[row[np.asarray(atlas.get_mesh_chart(mesh, i).faces)]] = count + i
         count += atlas.get_mesh_chart_count(mesh)
     chart[triangle_areas(uv) == 0] = -1
+    rows = np.flatnonzero(chart >= 0)  # xatlas stretches a chart to whole texels: back to the area of its surface
+    surface = np.bincount(chart[rows], triangle_areas(points[faces[rows]]))
+    uv[rows] *= np.sqrt(surface / np.bincount(chart[rows], np.abs(triangle_areas(uv[rows]))))[chart[rows], None, None]
     return uv, chart
 
 

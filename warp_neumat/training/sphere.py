@@ -1,7 +1,7 @@
 """The picture that a BRDF fit is judged by: a sphere under one key and one fill light, and its error measures.
 
 Orthographic view along −z, sphere of the picture's size, directional lights. What is compared is what is seen: radiance
-clipped to [0, 1] and sRGB-encoded. MAE and RMSE are taken over the pixels that the sphere covers, SSIM over the picture.
+clipped to [0, 1] and sRGB-encoded. MAE and RMSE are taken over the pixels of the sphere, SSIM over the whole picture.
 """
 
 from __future__ import annotations

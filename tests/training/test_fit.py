@@ -1,0 +1,142 @@
+"""`fit` from end to end on tiny models: determinism, resumption, the stored numbers, and errors."""
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from warp_neumat.io.asset import read_asset  # noqa: E402
+from warp_neumat.io.brdf import open_brdf  # noqa: E402
+from warp_neumat.models import neubrdf  # noqa: E402
+from warp_neumat.reference.neubrdf import reference_eval  # noqa: E402
+from warp_neumat.training import fit as fitting  # noqa: E402
+from warp_neumat.training.fit import checkpoint_path, fit  # noqa: E402
+from warp_neumat.training.losses import LogCosine  # noqa: E402
+from warp_neumat.training.loop import Plan, Trainer  # noqa: E402
+from warp_neumat.training.sphere import render_sphere, sphere_error  # noqa: E402
+
+SOURCE = "analytic:ggx?roughness=0.5&f0=0.9,0.6,0.3&diffuse=0.1"
+TINY = {"nside": 4, "bits": 5, "features": 8, "hidden": (16, 16)}
+
+
+def make_trainer(checkpoint=None, seed=0, **plan):
+    source = open_brdf(SOURCE)
+    model = neubrdf.build(neubrdf.configure(source, TINY), seed)
+    sampler, plan = fitting.BRDFData.sampler(source), Plan(**{"steps": 150, "batch": 256, "seed": seed, **plan})
+    return Trainer(model, sampler, LogCosine(), plan, checkpoint=checkpoint, identity={"source": SOURCE})
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory):
+    out = tmp_path_factory.mktemp("fit") / "a.neumat"
+    seen = []
+    header = fit(SOURCE, out, steps=70, progress=lambda fraction, text: seen.append((fraction, text)), **TINY)
+    return out, header, seen
+
+
+def test_fit_learns_and_stores_what_it_says(fitted):
+    out, header, seen = fitted
+    tensors, stored = read_asset(out)
+    assert stored == header
+    assert not checkpoint_path(out).exists()
+    fractions = [fraction for fraction, _ in seen]
+    assert fractions == sorted(fractions)
+    assert fractions[-1] == 1.0
+    # The numbers in the header are those of the stored fp16 values, seen by the float64 reference.
+    source = open_brdf(SOURCE)
+    picture = render_sphere(lambda wi, wo: reference_eval(tensors, stored["config"], wi, wo))
+    error = sphere_error(picture, render_sphere(source.eval))
+    assert error["mae"] == pytest.approx(header["metrics"]["mae"], rel=1e-3)
+    assert error["rmse"] == pytest.approx(header["metrics"]["rmse"], rel=1e-3)
+    assert header["metrics"]["bytes"] == sum(t.nbytes for t in tensors.values())
+    flat = sphere_error(render_sphere(lambda wi, wo: np.full((len(wi), 3), 0.1)), render_sphere(source.eval))
+    assert error["mae"] < 0.25 * flat["mae"]
+
+
+def test_same_seed_same_tensors_other_seed_others():
+    runs = []
+    for seed in (0, 0, 1):
+        trainer = make_trainer(seed=seed, steps=60)
+        trainer.run()
+        runs.append(trainer.model.to_asset()[0])
+    assert all(np.array_equal(runs[0][name], runs[1][name]) for name in runs[0])
+    assert not np.array_equal(runs[0]["indices"], runs[2]["indices"])
+
+
+@pytest.mark.parametrize("interrupted_in", ["features", "codebook", "round"])
+def test_resumed_fit_equals_an_uninterrupted_one(tmp_path, interrupted_in):
+    whole = make_trainer(steps=200)
+    whole.run()
+
+    path = tmp_path / "c"
+    first = make_trainer(path, steps=200, checkpoint_seconds=0.0)
+    save = first._save
+
+    def save_then_stop(*arguments):
+        save(*arguments)
+        stage = first.stages[first._stage]
+        if stage["name"] == interrupted_in and first._step > 0 or first._stage > names.index(interrupted_in):
+            raise KeyboardInterrupt
+
+    names = [stage["name"] for stage in first.stages]
+    first._save = save_then_stop
+    if interrupted_in == "round":  # too short here to have a boundary within: its first one will do
+        names.index = lambda name: 1
+    with pytest.raises(KeyboardInterrupt):
+        first.run()
+
+    second = make_trainer(path, steps=200, checkpoint_seconds=0.0)
+    assert second.resume()
+    second.run()
+    for name, value in whole.model.to_asset()[0].items():
+        np.testing.assert_array_equal(second.model.to_asset()[0][name], value, err_msg=name)
+
+
+def test_checkpoint_of_other_settings_is_refused(tmp_path):
+    path = tmp_path / "c"
+    trainer = make_trainer(path, steps=150)
+    trainer._save(torch.optim.Adam(trainer.model.parameters()), [])
+    with pytest.raises(ValueError, match=r"c: plan: was .*'seed': 0.* now .*'seed': 7.*; use the same settings"):
+        make_trainer(path, seed=7).resume()
+    path.write_bytes(b"not a checkpoint at all")
+    with pytest.raises(ValueError, match="c: file: no readable checkpoint"):
+        make_trainer(path).resume()
+    assert not make_trainer(tmp_path / "none").resume()
+
+
+def test_budget_ends_in_time():
+    trainer = make_trainer(budget_seconds=1.0)
+    facts = trainer.run()
+    assert facts["steps"] > 10
+    assert facts["seconds"] < 20  # a stage's preparation is not cut short
+    assert trainer.model.quantised
+
+
+def test_divergence_is_an_error():
+    trainer = make_trainer()
+    with torch.no_grad():
+        trainer.model.layers[0].weight.fill_(float("nan"))
+    with pytest.raises(FloatingPointError, match="diverged in stage features"):
+        trainer.run()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        ({"model": "nubrdf"}, ValueError, "nearest: neubrdf"),
+        ({"nsides": 8}, ValueError, "no option 'nsides'; nearest: nside"),
+        ({"preset": "standart"}, ValueError, "nearest: standard"),
+        ({"steps": 0}, ValueError, "steps must be a whole number of at least 1"),
+        ({"seed": -1}, ValueError, "seed must be"),
+        ({"budget_seconds": -2.0}, ValueError, "budget_seconds must be above 0"),
+        ({"device": "cuda:99"}, ValueError, "device 'cuda:99' cannot be used"),
+        ({"device": "gpu"}, ValueError, "device 'gpu' cannot be used"),
+        ({"out": "missing/a.neumat"}, FileNotFoundError, "no folder"),
+    ],
+)
+def test_wrong_arguments_are_explained_before_training(tmp_path, monkeypatch, arguments, error, message):
+    monkeypatch.chdir(tmp_path)
+    out = arguments.pop("out", "a.neumat")
+    with pytest.raises(error, match=message):
+        fit(SOURCE, out, **arguments)
+    assert list(tmp_path.iterdir()) == []
