@@ -1,10 +1,10 @@
 """Small networks: ours beside Dr.Jit's LLVM MLP and torch, and the measured peak of fused multiply-adds.
 
-All run in one process, in turns, on the same number of cores. ``cache``: inputs and outputs stay in the second-level cache,
-so arithmetic decides; ``stream``: 2²⁰ evaluations go through memory, so bytes do. Each peer is given its best data type and
-batch size, found here first. ``pair`` is MobileVR's coarse network (23→8→8→8→8) followed by its fine one (24→8→8→8→3) with
-the coarse outputs among its inputs. ``error`` is the largest deviation from float64 over the largest output. A GFLOP counts
-two operations per weight.
+All run in one process, in turns, on the same number of cores. ``cache``: inputs and outputs stay in the second-level
+cache, so arithmetic decides; ``stream``: 2²⁰ evaluations go through memory, so bytes do. Each peer is given its best batch
+size, found here first, in every data type it has. ``pair`` is MobileVR's coarse network (23→8→8→8→8) followed by its fine
+one (24→8→8→8→3), with the coarse outputs among its inputs. ``error`` is the largest deviation from float64 over the
+largest output. A GFLOP counts two operations per weight.
 """
 
 import itertools
@@ -176,14 +176,15 @@ def torch_peers(problem: Problem, data_rows: int, evaluations: int, workers: int
                 return chain(h, layers[0])
             return chain(torch.cat([h[:, cut:], chain(h[:, :cut], layers[0])], dim=1), layers[1])
 
-        def call(parts=parts, network=network, turns=max(1, evaluations // data_rows)):
+        turns = max(1, evaluations // data_rows)
+
+        def call(parts=parts, network=network, turns=turns):
             for _ in range(turns):
                 for part in parts:
                     network(part)
 
         got = network(parts[0][:4096]).float().numpy()
-        done = data_rows * max(1, evaluations // data_rows)
-        yield f"torch {name}", call, error_of(got, problem.exact(x.numpy()[: len(got)])), done
+        yield f"torch {name}", call, error_of(got, problem.exact(x.numpy()[: len(got)])), data_rows * turns
 
 
 def drjit_peers(problem: Problem, data_rows: int, evaluations: int, workers: int):
@@ -206,7 +207,7 @@ def drjit_peers(problem: Problem, data_rows: int, evaluations: int, workers: int
             net = nn.Sequential(*chain).alloc(Tensor, shape.inputs)
             for layer, w, b in zip(net.layers[::2], ws, bs, strict=True):
                 layer.weights, layer.bias = Tensor(w.astype(scalar)), Tensor(b.astype(scalar))
-            nets.append(nn.pack(net, layout="inference")[-1])
+            nets.append(nn.pack(net, layout="inference"))
         x = problem.rows(width)
         columns = [Array(np.ascontiguousarray(x[:, k].astype(scalar))) for k in range(problem.own)]
         dr.make_opaque(columns)
@@ -219,13 +220,15 @@ def drjit_peers(problem: Problem, data_rows: int, evaluations: int, workers: int
             dr.eval(out)
             return out
 
-        def call(run=run, turns=max(1, evaluations // width)):
+        turns = max(1, evaluations // width)
+
+        def call(run=run, turns=turns):
             for _ in range(turns):
                 run()
             dr.sync_thread()
 
         got = np.stack([np.array(c) for c in run()], axis=1)[:4096]
-        yield f"drjit {name}", call, error_of(got, problem.exact(x[:4096])), width * max(1, evaluations // width)
+        yield f"drjit {name}", call, error_of(got, problem.exact(x[:4096])), width * turns
 
 
 def fastest(peers) -> dict[str, tuple]:

@@ -1,7 +1,7 @@
 """Camera raster beside primary rays through wp.mesh_query_ray, at 1920×1080 on the same cores.
 
 Both draw triangle id, barycentrics and depth of the same frame. The rays' BVH is built once, before the clock starts;
-rays are launched over the same workers by the same dispatcher, in 8 × 8 pixel blocks, which is the faster order.
+rays are launched over the same workers by the same dispatcher, in 8 × 8 pixel blocks (row by row takes as long).
 Columns after ``mismatch_fraction`` break a frame into its stages [ms], measured one after the other in runs of their
 own.
 """

@@ -105,7 +105,10 @@ def test_metric_and_gradient_match_autograd(rng):
     batches = [prepared(model, source, rng, 64), prepared(model, source, rng, 32)]
     total = sum((0.5 * loss.residual(model.predict(b), b) ** 2).sum() for b in batches)
     expected = torch.autograd.grad(total, model.table)[0]
-    torch.testing.assert_close(model.gradient(batches, loss), expected, rtol=1e-4, atol=1e-5)
+    gradient, error = model.gradient(batches, loss)
+    torch.testing.assert_close(gradient, expected, rtol=1e-4, atol=1e-5)
+    # Every sample touches up to four points of each grid, fewer where it lies on a line between two.
+    assert 4.0 * float(2 * total) < float(error.sum()) < 8.001 * float(2 * total)
 
     def residuals(table):
         bag = torch.nn.functional.embedding_bag
@@ -117,13 +120,12 @@ def test_metric_and_gradient_match_autograd(rng):
 
     jacobian = torch.autograd.functional.jacobian(residuals, model.table.detach())  # (r, n, k)
     expected = torch.einsum("rni,rnj->nij", jacobian, jacobian)
-    # Where both hands of a pixel share a point (wi's and wo's grids are apart) cross terms would differ: there are none.
     torch.testing.assert_close(model.metric(batches, loss), expected, rtol=1e-3, atol=1e-4)
 
 
 def test_reassignment_lowers_the_error(rng):
     source, loss = open_brdf("analytic:ggx?roughness=0.4&f0=0.9,0.5,0.2"), LogCosine()
-    model = neubrdf.build(neubrdf.configure(source, {"nside": 8, "bits": 4}), seed=0)
+    model = neubrdf.build(neubrdf.configure(source, {"nside": 8, "bits": 6}), seed=0)
     batches = [prepared(model, source, rng, 8192)]
     optimiser = torch.optim.Adam(model.trainable("features"), lr=5e-3)
     for _ in range(60):
@@ -138,7 +140,7 @@ def test_reassignment_lowers_the_error(rng):
     before = error()
     model.event("codebook", batches, loss)
     assert error() < 0.95 * before
-    assert model.statistics()["codebook_used"] > 12
+    assert model.statistics()["codebook_used"] > 48
 
 
 def test_codebook_of_separate_clusters_is_exact(rng):

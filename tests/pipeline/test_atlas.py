@@ -144,6 +144,15 @@ def test_mirrored_halves_get_places_of_their_own(rng):
     assert atlas.chart_count == 2
 
 
+def test_charts_on_each_other_get_places_of_their_own(rng):
+    mesh = quads((WHOLE, 1), (WHOLE, 1))
+    mesh.face_mesh[:] = 0
+    atlas = Atlas.build(mesh, 128, cache=False)
+    check_guarantee(atlas, rng)
+    assert atlas.sources == {"quad0": "repacked"}
+    assert atlas.chart_count == 2
+
+
 def winding_fan():
     """Return a fan that turns 1.5 times around its centre in UV: one chart, one winding, and still lying on itself."""
     angle = np.linspace(0, 3 * np.pi, 25)

@@ -11,8 +11,8 @@ from warp_neumat.models import neubrdf  # noqa: E402
 from warp_neumat.reference.neubrdf import reference_eval  # noqa: E402
 from warp_neumat.training import fit as fitting  # noqa: E402
 from warp_neumat.training.fit import checkpoint_path, fit  # noqa: E402
-from warp_neumat.training.losses import LogCosine  # noqa: E402
 from warp_neumat.training.loop import Plan, Trainer  # noqa: E402
+from warp_neumat.training.losses import LogCosine  # noqa: E402
 from warp_neumat.training.sphere import render_sphere, sphere_error  # noqa: E402
 
 SOURCE = "analytic:ggx?roughness=0.5&f0=0.9,0.6,0.3&diffuse=0.1"
@@ -30,7 +30,7 @@ def make_trainer(checkpoint=None, seed=0, **plan):
 def fitted(tmp_path_factory):
     out = tmp_path_factory.mktemp("fit") / "a.neumat"
     seen = []
-    header = fit(SOURCE, out, steps=70, progress=lambda fraction, text: seen.append((fraction, text)), **TINY)
+    header = fit(SOURCE, out, steps=250, progress=lambda fraction, text: seen.append((fraction, text)), **TINY)
     return out, header, seen
 
 
@@ -74,14 +74,11 @@ def test_resumed_fit_equals_an_uninterrupted_one(tmp_path, interrupted_in):
 
     def save_then_stop(*arguments):
         save(*arguments)
-        stage = first.stages[first._stage]
-        if stage["name"] == interrupted_in and first._step > 0 or first._stage > names.index(interrupted_in):
+        within = first._step > 0 or interrupted_in == "round"  # that is too short here to have a boundary within
+        if first.stages[first._stage]["name"] == interrupted_in and within:
             raise KeyboardInterrupt
 
-    names = [stage["name"] for stage in first.stages]
     first._save = save_then_stop
-    if interrupted_in == "round":  # too short here to have a boundary within: its first one will do
-        names.index = lambda name: 1
     with pytest.raises(KeyboardInterrupt):
         first.run()
 

@@ -5,12 +5,9 @@ the gather is about to read. Each quad remembers the epoch it was last shaded in
 which is both the reuse over frames and the repair of what comes into view in between.
 """
 
-import functools
-
 import warp as wp
 
 from warp_neumat.kernels import dispatch
-from warp_neumat.kernels.shade import QUAD_SHIFT
 
 wp.set_module_options(dispatch.module_options())
 
@@ -128,74 +125,101 @@ def pixel_material_kernel(
         texel_material[i] = wp.uint8(m)
 
 
-@functools.cache
-def make_list_kernel(fill: bool):
-    """Return the kernel that counts (``fill=False``) or writes a row of quads, one segment per material."""
+# One row of quads. Most quads are empty, so eight bytes of either texel row are tested at once. A texel outside an image
+# of odd size reads as 0. With `fill`, the cursors are positions in `quads`; without, they count.
+_ROW = """
+    const int columns = (width + 1) >> 1;
+    const int y = 2 * row;
+    const unsigned char *s0 = seen.data + (long long)y * width, *m0 = texel_material.data + (long long)y * width;
+    const bool two = y + 1 < height;
+    const unsigned char *s1 = two ? s0 + width : s0, *m1 = two ? m0 + width : m0;
+    int* stamps = stamp.data + row * columns;
+    int seen_texels = 0, shaded_texels = 0;
+    for (int column = 0; column < columns; ++column) {
+        const int x = 2 * column;
+        if (x + 8 <= width) {
+            unsigned long long a, b;
+            memcpy(&a, s0 + x, 8);
+            memcpy(&b, s1 + x, 8);
+            if (!(a | b)) { column += 3; continue; }
+        }
+        const bool wide = x + 1 < width;
+        const int marks = s0[x] + (wide ? s0[x + 1] : 0) + (two ? s1[x] + (wide ? s1[x + 1] : 0) : 0);
+        if (!marks) continue;
+        seen_texels += marks;
+        if (stamps[column] >= epoch) continue;
+        const int m[4] = {m0[x], wide ? m0[x + 1] : 0, two ? m1[x] : 0, two && wide ? m1[x + 1] : 0};
+        for (int q = 0; q < 4; ++q) {
+            if (!m[q]) continue;
+            ++shaded_texels;
+            bool fresh = true;  // a quad on a border between materials is listed once for each
+            for (int p = 0; p < q; ++p) fresh = fresh && m[p] != m[q];
+            if (!fresh) continue;
+            int& at = cursor.data[(m[q] - 1) * rows + row];
+            if (fill) quads.data[at] = column | row << 16;
+            ++at;
+        }
+        if (fill) stamps[column] = epoch;
+    }
+    if (!fill) {
+        seen_count.data[row] = seen_texels;
+        shaded_count.data[row] = shaded_texels;
+    }
+"""
 
-    @wp.func
-    def texel(image: wp.array(dtype=wp.uint8), x: int, y: int, width: int, height: int) -> int:
-        value = int(0)
-        if x < width and y < height:
-            value = int(image[y * width + x])
-        return value
 
-    @wp.kernel(module="unique", module_options=dispatch.module_options())
-    def list_kernel(
-        first: int,
-        seen: wp.array(dtype=wp.uint8),
-        texel_material: wp.array(dtype=wp.uint8),
-        width: int,
-        height: int,
-        rows: int,
-        epoch: int,
-        stamp: wp.array(dtype=wp.int32),
-        # counts per [material][row] when counting, cursors into ``quads`` when filling
-        cursor: wp.array(dtype=wp.int32),
-        seen_count: wp.array(dtype=wp.int32),
-        shaded_count: wp.array(dtype=wp.int32),
-        quads: wp.array(dtype=wp.int32),
-    ):
-        row = first + wp.tid()
-        columns = (width + 1) >> 1
-        seen_texels = int(0)
-        shaded_texels = int(0)
-        for column in range(columns):
-            x = 2 * column
-            y = 2 * row
-            marks = (
-                texel(seen, x, y, width, height)
-                + texel(seen, x + 1, y, width, height)
-                + texel(seen, x, y + 1, width, height)
-                + texel(seen, x + 1, y + 1, width, height)
-            )
-            if marks > 0:
-                seen_texels += marks
-                if stamp[row * columns + column] < epoch:
-                    m0 = texel(texel_material, x, y, width, height)
-                    m1 = texel(texel_material, x + 1, y, width, height)
-                    m2 = texel(texel_material, x, y + 1, width, height)
-                    m3 = texel(texel_material, x + 1, y + 1, width, height)
-                    for q in range(4):
-                        m = wp.where(q == 0, m0, wp.where(q == 1, m1, wp.where(q == 2, m2, m3)))
-                        # A quad on a border between materials is listed once for each.
-                        fresh = m > 0
-                        if q > 0 and m == m0:
-                            fresh = False
-                        if q > 1 and m == m1:
-                            fresh = False
-                        if q > 2 and m == m2:
-                            fresh = False
-                        if fresh:
-                            at = (m - 1) * rows + row
-                            if wp.static(fill):
-                                quads[cursor[at]] = column | (row << QUAD_SHIFT)
-                            cursor[at] = cursor[at] + 1
-                        if m > 0:
-                            shaded_texels += 1
-                    if wp.static(fill):
-                        stamp[row * columns + column] = epoch
-        if not wp.static(fill):
-            seen_count[row] = seen_texels
-            shaded_count[row] = shaded_texels
+@wp.func_native(_ROW)
+def _list_row(
+    row: int,
+    seen: wp.array(dtype=wp.uint8),
+    texel_material: wp.array(dtype=wp.uint8),
+    width: int,
+    height: int,
+    rows: int,
+    epoch: int,
+    fill: int,
+    stamp: wp.array(dtype=wp.int32),
+    cursor: wp.array(dtype=wp.int32),
+    seen_count: wp.array(dtype=wp.int32),
+    shaded_count: wp.array(dtype=wp.int32),
+    quads: wp.array(dtype=wp.int32),
+): ...
 
-    return list_kernel
+
+@wp.kernel
+def list_kernel(
+    first: int,
+    seen: wp.array(dtype=wp.uint8),
+    texel_material: wp.array(dtype=wp.uint8),
+    width: int,
+    height: int,
+    rows: int,
+    epoch: int,
+    fill: int,
+    # outputs
+    stamp: wp.array(dtype=wp.int32),
+    cursor: wp.array(dtype=wp.int32),
+    seen_count: wp.array(dtype=wp.int32),
+    shaded_count: wp.array(dtype=wp.int32),
+    quads: wp.array(dtype=wp.int32),
+):
+    """Count (``fill`` = 0), or write and stamp (1), the quads of a row that have a seen texel and an older stamp.
+
+    ``cursor`` is [material][row]: counts in the first pass, positions in ``quads`` in the second. ``seen_count`` and
+    ``shaded_count`` [row] receive texels that are read and texels that the listed quads shade.
+    """
+    _list_row(
+        first + wp.tid(),
+        seen,
+        texel_material,
+        width,
+        height,
+        rows,
+        epoch,
+        fill,
+        stamp,
+        cursor,
+        seen_count,
+        shaded_count,
+        quads,
+    )

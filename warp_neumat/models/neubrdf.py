@@ -279,7 +279,8 @@ class NeuBRDF(nn.Module):
 
         Points of one colour share no pixel, so with all others fixed each sees an exact least-squares problem of its
         own (but for the decoder's curvature). What one colour leaves over, the next takes into account: neighbours
-        learn to average to values that no primitive holds.
+        learn to average to values that no primitive holds. A change that does not lower the error of a point's samples
+        is undone.
         """
         metric = self.metric(batches, loss)
         words, points = self.codebook.detach(), self.config.points
@@ -288,12 +289,13 @@ class NeuBRDF(nn.Module):
         eye = torch.eye(self.config.features, device=words.device)
         for part in range(8):
             live = torch.nonzero((size > 0) & (side == part // 4) & (self.colour == part % 4)).flatten()
-            if not len(live):
-                continue
+            gradient, error = self.gradient(batches, loss)
             local = metric[live] + (_DAMPING * size[live])[:, None, None] * eye
-            step = torch.linalg.solve(local, self.gradient(batches, loss)[live])
-            target = words[self.indices[live]] - step
+            before = self.indices[live]
+            target = words[before] - torch.linalg.solve(local, gradient[live])
             self.indices[live] = vq.assign(target, local, words)[0].int()
+            worse = self.gradient(batches, loss, errors_only=True)[1][live] >= error[live]
+            self.indices[live] = torch.where(worse, before, self.indices[live])
 
     def metric(self, batches, loss) -> torch.Tensor:
         """Return H = Σ w² JᵀJ of every grid point, (2n, k, k), J the derivative of the residuals by ψ, w the weight."""
@@ -308,16 +310,20 @@ class NeuBRDF(nn.Module):
             _scatter(metric, batch["corner"].view(-1, 4), batch["weight"].view(-1, 4) ** 2, square)
         return metric.view(2 * points, k, k)
 
-    def gradient(self, batches, loss) -> torch.Tensor:
-        """Return Σ w Jᵀr of every grid point, (2n, k): half the gradient of Σ r²."""
-        k = self.config.features
-        gradient = self.table.new_zeros(2 * self.config.points, k)
+    def gradient(self, batches, loss, errors_only: bool = False) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return Σ w Jᵀr of every grid point, (2n, k), half the gradient of Σ r², and Σ r² of its samples, (2n,)."""
+        k, total = self.config.features, 2 * self.config.points
+        gradient, error = self.table.new_zeros(total, k), self.table.new_zeros(total, 1)
         for batch in batches:
-            psi = self.gather(batch).detach().requires_grad_()
+            psi = self.gather(batch).detach().requires_grad_(not errors_only)
             residual = loss.residual(torch.expm1(self.decode(psi).clamp_max(16.0)), batch)
-            pull = torch.autograd.grad((0.5 * residual * residual).sum(), psi)[0].view(-1, k)
-            _scatter(gradient, batch["corner"].view(-1, 4), batch["weight"].view(-1, 4), pull)
-        return gradient
+            corner, weight = batch["corner"].view(-1, 4), batch["weight"].view(-1, 4)
+            square = residual.detach().square().sum(1, keepdim=True).repeat_interleave(2, 0)
+            _scatter(error, corner, (weight > 0).float(), square)
+            if not errors_only:
+                pull = torch.autograd.grad((0.5 * residual * residual).sum(), psi)[0].view(-1, k)
+                _scatter(gradient, corner, weight, pull)
+        return gradient, error[:, 0]
 
     # --- storing ---
 

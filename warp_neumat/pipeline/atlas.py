@@ -251,7 +251,7 @@ class _Maker:
         return None
 
     def _keep(self, chart) -> _Layout | None:
-        """Return the only part's own layout, or ``None`` where it leaves [0, 1]; the guarantee is for the caller to check."""
+        """Return the only part's own layout, ``None`` where it leaves [0, 1]; the caller checks for leaks."""
         uv = self.uv[chart >= 0]
         if uv.min() < -1e-3 or uv.max() > 1 + 1e-3:
             return None

@@ -7,7 +7,7 @@ import warp as wp
 
 from warp_neumat.kernels import dispatch
 from warp_neumat.kernels.shade import WORDS, Lights, Surface, make_shade_kernel
-from warp_neumat.kernels.worklist import make_list_kernel
+from warp_neumat.kernels.worklist import list_kernel
 from warp_neumat.materials.base import Material
 from warp_neumat.pipeline.surface_mesh import SurfaceMesh
 
@@ -61,10 +61,9 @@ class TexelShader:
         self._seen_count, self._shaded_count = zeros(self.rows, wp.int32), zeros(self.rows, wp.int32)
         # A quad whose four texels have different materials is listed under each.
         self._quads = zeros(columns * self.rows * min(4, kinds), wp.int32)
-        common = [self.seen, texel_material, self.width, self.height, self.rows, 0, self.stamp]
+        common = [self.seen, texel_material, self.width, self.height, self.rows, 0, 0, self.stamp]
         common += [self._cursor, self._seen_count, self._shaded_count, self._quads]
-        self._count_job = dispatch.Job(make_list_kernel(False), self.rows, common, device=self.device, grain=16)
-        self._fill_job = dispatch.Job(make_list_kernel(True), self.rows, common, device=self.device, grain=16)
+        self._list_job = dispatch.Job(list_kernel, self.rows, common, device=self.device, grain=16)
 
         surface = Surface()
         surface.width, surface.height = self.width, self.height
@@ -104,15 +103,14 @@ class TexelShader:
     def share_seen(self, seen: wp.array) -> None:
         """Read ``seen``, flat uint8, in place of the own :attr:`seen`."""
         self.seen = seen
-        for job in (self._count_job, self._fill_job):
-            job.set(0, seen)
+        self._list_job.set(0, seen)
 
     def list(self, epoch: int) -> ListCounts:
         """Compact the quads with a seen texel that were not yet shaded in ``epoch``, sorted by material; stamp them."""
-        for job in (self._count_job, self._fill_job):
-            job.set(5, int(epoch))
+        self._list_job.set(5, int(epoch))
+        self._list_job.set(6, 0)
         self._cursor.zero_()
-        self._count_job.run()
+        self._list_job.run()
         counts = self._cursor.numpy()  # [material][row]; on the CPU a view
         ends = np.cumsum(counts, dtype=np.int64)
         starts = ends - counts
@@ -122,7 +120,8 @@ class TexelShader:
             counts[...] = starts
         else:
             self._cursor.assign(starts.astype(np.int32))
-        self._fill_job.run()
+        self._list_job.set(6, 1)
+        self._list_job.run()
         return ListCounts(
             int(self._seen_count.numpy().sum()), int(self._shaded_count.numpy().sum()), tuple(int(n) for n in totals)
         )
