@@ -123,8 +123,13 @@ def test_static_file(tmp_path):
 
 def test_orbit_word_and_orbit_file_agree(tmp_path):
     word = load_camera("orbit", LO, HI, 10, **SIZE)
-    file = loaded(tmp_path, {"orbit": {"turns": 1}})
+    file = loaded(tmp_path, {"orbit": {}})
     np.testing.assert_array_equal(word.at(3).clip(), file.at(3).clip())
+
+
+def test_default_orbit_turns_once_but_calmly():
+    assert orbit(LO, HI, 24, **SIZE).turns == pytest.approx(0.1)
+    assert orbit(LO, HI, 480, **SIZE).turns == 1.0
 
 
 KEYS = [{"frame": f, "eye": [x, 1, 9], "target": [x / 2, 1, 0]} for f, x in ((0, 0.0), (4, 4.0), (6, 5.0), (9, 11.0))]

@@ -2,12 +2,14 @@
 
 The atlas guarantees that the four texels around any point of a chart belong to that chart (``pipeline/atlas.py``), so a
 plain bilinear fetch never reads another chart.
+
+``blank`` remembers which blocks of the picture hold nothing but background, so that those which stay empty cost no writes.
 """
 
 import warp as wp
 
 from warp_neumat.kernels import dispatch
-from warp_neumat.kernels.worklist import footprint
+from warp_neumat.kernels.worklist import drawn, footprint
 
 wp.set_module_options(dispatch.module_options())
 
@@ -25,10 +27,16 @@ def gather_kernel(
     height: int,
     background: wp.vec3,
     # outputs
+    blank: wp.array(dtype=wp.uint8),
     image: wp.array(dtype=wp.float32),
 ):
     b = first + wp.tid()
-    for i in range(b * per_block, wp.min((b + 1) * per_block, pixel_count)):
+    end = wp.min((b + 1) * per_block, pixel_count)
+    empty = wp.where(drawn(pixel_triangle, b * per_block, end) == 0, 1, 0)
+    if empty == 1 and blank[b] == wp.uint8(1):
+        return
+    blank[b] = wp.uint8(empty)
+    for i in range(b * per_block, end):
         f = pixel_triangle[i]
         if f >= 0:
             x, y, u, v = footprint(corner_uv, f, pixel_barycentric[2 * i], pixel_barycentric[2 * i + 1], width, height)
@@ -52,11 +60,17 @@ def resolve_kernel(
     radiance: wp.array(dtype=wp.float16),
     background: wp.vec3,
     # outputs
+    blank: wp.array(dtype=wp.uint8),
     image: wp.array(dtype=wp.float32),
 ):
     """The picture from radiance that was shaded per pixel."""
     b = first + wp.tid()
-    for i in range(b * per_block, wp.min((b + 1) * per_block, pixel_count)):
+    end = wp.min((b + 1) * per_block, pixel_count)
+    empty = wp.where(drawn(pixel_triangle, b * per_block, end) == 0, 1, 0)
+    if empty == 1 and blank[b] == wp.uint8(1):
+        return
+    blank[b] = wp.uint8(empty)
+    for i in range(b * per_block, end):
         covered = pixel_triangle[i] >= 0
         for c in range(3):
             image[3 * i + c] = wp.where(covered, float(radiance[4 * i + c]), background[c])

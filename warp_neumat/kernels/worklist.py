@@ -12,6 +12,20 @@ from warp_neumat.kernels import dispatch
 wp.set_module_options(dispatch.module_options())
 
 
+# All of -1 is background, so the complement's bits are zero exactly where nothing is drawn.
+_DRAWN = """
+    int bits = 0;
+    for (int i = begin; i < end; ++i) bits |= ~pixel_triangle.data[i];
+    return bits;
+"""
+
+
+@wp.func_native(_DRAWN)
+def drawn(pixel_triangle: wp.array(dtype=wp.int32), begin: int, end: int) -> int:
+    """Return 0 where the pixels ``begin`` … ``end`` − 1 are all background, at the speed memory is read."""
+    ...
+
+
 @wp.kernel
 def facing_kernel(
     first: int,
@@ -94,7 +108,10 @@ def mark_seen_kernel(
 ):
     """Mark the texels that the visible pixels will read; blocks may write the same 1 to the same texel."""
     b = first + wp.tid()
-    for i in range(b * per_block, wp.min((b + 1) * per_block, pixel_count)):
+    end = wp.min((b + 1) * per_block, pixel_count)
+    if drawn(pixel_triangle, b * per_block, end) == 0:
+        return
+    for i in range(b * per_block, end):
         f = pixel_triangle[i]
         if f >= 0:
             x, y, u, v = footprint(corner_uv, f, pixel_barycentric[2 * i], pixel_barycentric[2 * i + 1], width, height)

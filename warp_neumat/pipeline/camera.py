@@ -158,19 +158,21 @@ class OrbitPath(CameraPath):
         return Camera.look_at(eye, self.centre, near=near, far=far, **lens)
 
 
+CALM = 1.0 / 240.0
+"""Turns a frame of the default orbit: ten seconds a turn at 24 frames a second."""
+
 _FILL = 0.9  # of the picture's width or height, by the default orbit
 
 
-def _fitting_distance(lo, hi, elevation: float, fill: float, aspect: float) -> float:
-    """The nearest distance at which the box lies within tan ``fill`` (× ``aspect``) of the axis, from all azimuths."""
-    half = 0.5 * (np.asarray(hi, np.float64) - np.asarray(lo, np.float64))
-    corners = half * np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, 8).T
-    angle = np.linspace(0.0, 2.0 * math.pi, 256, endpoint=False)
+def _fitting_distance(points, centre, elevation: float, fill: float, aspect: float) -> float:
+    """The nearest distance at which ``points`` lie within tan ``fill`` (× ``aspect``) of the axis, from all azimuths."""
+    offset = np.asarray(points, np.float64) - centre
+    angle = np.linspace(0.0, 2.0 * math.pi, 128, endpoint=False)
     level, height = math.cos(elevation) * np.ones_like(angle), math.sin(elevation)
     back = np.stack([level * np.sin(angle), height * np.ones_like(angle), level * np.cos(angle)], axis=1)
     right = np.stack([np.cos(angle), np.zeros_like(angle), -np.sin(angle)], axis=1)
-    across, along = np.abs(right @ corners.T), back @ corners.T
-    upward = np.abs(np.cross(back, right) @ corners.T)
+    across, along = np.abs(right @ offset.T), back @ offset.T
+    upward = np.abs(np.cross(back, right) @ offset.T)
     # A point is inside where across <= fill · aspect · (distance - along), and likewise upward.
     return float((along + np.maximum(across / (fill * aspect), upward / fill)).max())
 
@@ -182,11 +184,12 @@ def orbit(
     *,
     width: int,
     height: int,
-    turns: float = 1.0,
+    turns: float | None = None,
     elevation: float = math.radians(15.0),
     azimuth: float = math.radians(35.0),
     distance: float | None = None,
     fov_y: float = math.radians(40.0),
+    outline=None,
 ) -> OrbitPath:
     """Return a path around the box ``lo`` … ``hi`` (of all frames), ``turns`` times within ``frames`` frames.
 
@@ -196,20 +199,26 @@ def orbit(
         frames: Length of the path, at least 1.
         width: Picture width [px].
         height: Picture height [px].
-        turns: Whole or broken turns, counterclockwise seen from above; negative ones go the other way.
+        turns: Whole or broken turns, counterclockwise seen from above; negative ones go the other way. By default one,
+            but no faster than :data:`CALM` turns a frame.
         elevation: Angle above the horizon [rad], in (−π/2, π/2).
         azimuth: Where the path starts [rad].
-        distance: From the centre [scene unit]; by default the nearest from which the box, seen from any side, leaves a
-            tenth of the picture's width or height free.
+        distance: From the centre [scene unit]; by default the nearest from which the outline, seen from any side,
+            leaves a tenth of the picture's width or height free.
         fov_y: Vertical field of view [rad].
+        outline: Points that the picture should hold, shape (N, 3); by default the corners of the box.
     """
     centre, radius = bounding_sphere(lo, hi)
     if frames < 1:
         raise ValueError(f"frames must be at least 1, got {frames}")
+    if turns is None:
+        turns = min(1.0, CALM * frames)
     if not abs(elevation) < 0.5 * math.pi * 0.9999:
         raise ValueError(f"elevation must be between -90 and 90 degrees, got {math.degrees(elevation):g}")
     if distance is None:
-        distance = _fitting_distance(lo, hi, elevation, _FILL * math.tan(0.5 * fov_y), width / height)
+        if outline is None:
+            outline = np.array(np.meshgrid(*zip(lo, hi, strict=True))).reshape(3, 8).T  # the box's corners
+        distance = _fitting_distance(outline, centre, elevation, _FILL * math.tan(0.5 * fov_y), width / height)
     if not 0 < distance < math.inf:
         raise ValueError(f"distance must be above 0, got {distance:g}")
     path = OrbitPath(centre, radius, distance, frames, turns, elevation, azimuth, fov_y, width, height)
@@ -267,7 +276,7 @@ _PLANES = ("near", "far")
 _ORBIT = ("turns", "elevation_degrees", "azimuth_degrees", "distance", "fov_degrees")
 
 
-def load_camera(spec, lo, hi, frames: int, *, width: int, height: int) -> CameraPath:
+def load_camera(spec, lo, hi, frames: int, *, width: int, height: int, outline=None) -> CameraPath:
     """Return the camera path that ``spec`` names: ``"orbit"``, or a JSON file.
 
     The file holds one of three things; everything but eye and target may be left out::
@@ -285,6 +294,7 @@ def load_camera(spec, lo, hi, frames: int, *, width: int, height: int) -> Camera
         frames: Number of frames that will be rendered; each is checked here, before the first one is rendered.
         width: Picture width [px].
         height: Picture height [px].
+        outline: Points (N, 3) that an orbit should hold in the picture, closer than the bounds' corners.
 
     Raises:
         OSError: If the file cannot be read.
@@ -292,12 +302,13 @@ def load_camera(spec, lo, hi, frames: int, *, width: int, height: int) -> Camera
     """
     size = {"width": width, "height": height}
     if str(spec) == "orbit":
-        return orbit(lo, hi, frames, **size)
+        return orbit(lo, hi, frames, **size, outline=outline)
     value = load_json(spec)
     centre, radius = bounding_sphere(lo, hi)
     if isinstance(value, dict) and "orbit" in value:
         Fields(value, str(spec), ("orbit",))
-        path = _orbit_of(Fields(value["orbit"], f"{spec}: orbit", _ORBIT), lo, hi, frames, size)
+        shot = {**size, "outline": outline}
+        path = _orbit_of(Fields(value["orbit"], f"{spec}: orbit", _ORBIT), lo, hi, frames, shot)
     elif isinstance(value, dict) and "keys" in value:
         fields = Fields(value, str(spec), ("keys", "interpolation", *_PLANES))
         keys = [Fields(key, f"{spec}: keys[{k}]", ("frame", *_POSE)) for k, key in enumerate(fields.items("keys"))]
@@ -318,12 +329,12 @@ def load_camera(spec, lo, hi, frames: int, *, width: int, height: int) -> Camera
     return path
 
 
-def _orbit_of(fields: Fields, lo, hi, frames: int, size: dict) -> OrbitPath:
-    given = {"turns": fields.number("turns", 1.0), "distance": fields.number("distance", None, low=0, open_low=True)}
+def _orbit_of(fields: Fields, lo, hi, frames: int, shot: dict) -> OrbitPath:
+    given = {"turns": fields.number("turns", None), "distance": fields.number("distance", None, low=0, open_low=True)}
     given["elevation"] = math.radians(fields.number("elevation_degrees", 15.0, low=-89, high=89))
     given["azimuth"] = math.radians(fields.number("azimuth_degrees", 35.0))
     given["fov_y"] = math.radians(fields.number("fov_degrees", 40.0, low=0, high=170, open_low=True))
-    return orbit(lo, hi, frames, **size, **given)
+    return orbit(lo, hi, frames, **shot, **given)
 
 
 def _pose(fields: Fields) -> np.ndarray:

@@ -117,7 +117,8 @@ class Renderer:
         frame_count = frame_count or self.sequence.frame_count
         lo, hi = self.sequence.bounds()
         if not isinstance(camera, CameraPath):
-            camera = load_camera(camera, lo, hi, frame_count, width=self.width, height=self.height)
+            picture = {"width": self.width, "height": self.height, "outline": self.sequence.outline()}
+            camera = load_camera(camera, lo, hi, frame_count, **picture)
         self.camera = camera
         self.lights = lights if isinstance(lights, PointLights) else lights_from(lights, lo, hi, frame_count)
         self.background = wp.vec3(*(float(c) for c in background))
@@ -133,6 +134,7 @@ class Renderer:
         )
         pixels = self.width * self.height
         self._image = wp.zeros((self.height, self.width, 3), dtype=wp.float32, device=self.device)
+        blank = wp.zeros(dispatch.blocks(pixels, _PIXELS), dtype=wp.uint8, device=self.device)
         pixel_triangle, pixel_barycentric = self.raster.triangle.flatten(), self.raster.barycentric.flatten()
 
         def job(kernel, count, inputs, outputs):
@@ -155,7 +157,7 @@ class Renderer:
                 gather.resolve_kernel,
                 pixels,
                 [pixel_triangle, pixels, _PIXELS, self.shader.radiance, self.background],
-                [self._image.flatten()],
+                [blank, self._image.flatten()],
             )
         else:
             if not isinstance(atlas, Atlas):
@@ -192,7 +194,7 @@ class Renderer:
                 gather.gather_kernel,
                 pixels,
                 [*pixel, self.shader.radiance, side, side, self.background],
-                [self._image.flatten()],
+                [blank, self._image.flatten()],
             )
         self._epoch, self._since = 0, 0
 

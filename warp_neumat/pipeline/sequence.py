@@ -256,6 +256,26 @@ class MeshSequence:
             highs.append(self._bounds[key][1])
         return np.min(lows, axis=0), np.max(highs, axis=0)
 
+    def outline(self, frames=None) -> np.ndarray:
+        """Return vertices that span the sequence's outline from every side: extremes along 128 directions, per frame.
+
+        Args:
+            frames: Frame numbers to look at; None means all, or 64 evenly spaced ones of a longer sequence.
+        Returns: Points (N, 3) float32.
+        """
+        if frames is None:
+            frames = np.unique(np.linspace(0, self.frame_count - 1, _BOUND_SAMPLES).round().astype(int))
+        # A Fibonacci lattice spreads the directions evenly.
+        k = np.arange(128)
+        z, turn = 1.0 - (2.0 * k + 1.0) / 128, k * np.pi * (3.0 - np.sqrt(5.0))
+        radius = np.sqrt(1.0 - z * z)
+        directions = np.stack([radius * np.cos(turn), radius * np.sin(turn), z]).astype(np.float32)
+        found = []
+        for key in dict.fromkeys(self._key(index) for index in frames):
+            points = self._motion.points(key, self.fps)
+            found.append(points[np.unique((points @ directions).argmax(axis=0))])
+        return np.concatenate(found)
+
     def digest(self) -> str:
         """Return a hash of faces, uv and rest points, 32 hexadecimal digits; the same for all animations of a file."""
         state = hashlib.blake2b(digest_size=16)
