@@ -1,10 +1,10 @@
 """Small networks: ours beside Dr.Jit's LLVM MLP and torch, and the measured peak of fused multiply-adds.
 
 All run in one process, in turns, on the same number of cores. ``cache``: inputs and outputs stay in the second-level
-cache, so arithmetic decides; ``stream``: 2²⁰ evaluations go through memory, so bytes do. Each peer is given its best batch
-size, found here first, in every data type it has. ``pair`` is MobileVR's coarse network (23→8→8→8→8) followed by its fine
-one (24→8→8→8→3), with the coarse outputs among its inputs. ``error`` is the largest deviation from float64 over the
-largest output. A GFLOP counts two operations per weight.
+cache, so arithmetic decides; ``stream``: 2²⁰ evaluations go through memory, so bytes do. Each peer is given its best
+batch size, found here first, in every data type it has. ``pair`` is MobileVR's coarse network (23→8→8→8→8) followed by
+its fine one (24→8→8→8→3), with the coarse outputs among its inputs. ``error`` is the largest deviation from float64
+over the largest output. A GFLOP counts two operations per weight.
 """
 
 import itertools
@@ -188,7 +188,7 @@ def torch_peers(problem: Problem, data_rows: int, evaluations: int, workers: int
 
 
 def drjit_peers(problem: Problem, data_rows: int, evaluations: int, workers: int):
-    """Yield (name, call, error, evaluations) for Dr.Jit's packed networks on its LLVM backend, in two types and widths."""
+    """Yield (name, call, error, evaluations) for Dr.Jit's packed networks on LLVM, in two types and widths."""
     import drjit as dr
     from drjit import nn
     from drjit.llvm import Float, Float16, TensorXf, TensorXf16

@@ -62,8 +62,8 @@ def test_grid_gather_matches_float64(bags):
     expected.backward(cotangent.double())
     torch.testing.assert_close(out.double(), expected, rtol=0, atol=2e-6)
     scale = ops.grid_scatter(cotangent.abs(), corner, weight, 50)
-    # Worst seen 4e-7 of the sum of magnitudes; x 5.
-    assert ((table.grad - exact.grad).abs() / scale).max() < 2e-6
+    # Worst seen 1.1e-7 of the sum of magnitudes; x 4.
+    assert ((table.grad - exact.grad).abs() / scale).max() < 4.4e-7
 
 
 def test_grid_gather_is_the_same_on_any_number_of_cores(bags):

@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 import pytest
-from tiny_gltf import TRIANGLE, TinyGltf
 
+from tests.tiny_gltf import TRIANGLE, TinyGltf
 from warp_neumat.io.animation import Animator, Deformer, sample
 from warp_neumat.io.gltf import Channel, load_gltf
 

@@ -61,8 +61,8 @@ def test_network_matches_float64(merl, pair, name):
     got = source.eval(wi, wo)
     assert got.dtype == np.float32
     assert got.shape == (4000, 3)
-    # Worst seen 3e-5 (chrome, at its peak, where the network's first layer amplifies rounding); x 3.
-    assert (np.abs(got - expected) / (1 + expected)).max() < 1e-4
+    # Worst seen 2e-6 (chrome); x 3.
+    assert (np.abs(got - expected) / (1 + expected)).max() < 6e-6
 
 
 def test_network_is_isotropic(merl, pair):
@@ -71,8 +71,8 @@ def test_network_is_isotropic(merl, pair):
     source = open_brdf(f"{merl}:nickel")
     wi, wo = wi[1000:], wo[1000:]  # at the mirror direction itself the azimuth of h is rounding
     a, b = source.eval(wi, wo), source.eval(wi @ turn, wo @ turn)
-    # Worst seen 2e-5; x 3.
-    assert (np.abs(a - b) / (1 + a)).max() < 6e-5
+    # Worst seen 8e-6; x 3.
+    assert (np.abs(a - b) / (1 + a)).max() < 2.4e-5
 
 
 def test_path_may_contain_colons(merl, tmp_path, pair):
@@ -116,7 +116,7 @@ def test_ggx_matches_the_textbook(pair):
     aspect = np.sqrt(1 - 0.9 * 0.5)
     unit = [d.astype(np.float64) / np.linalg.norm(d.astype(np.float64), axis=1, keepdims=True) for d in pair]
     expected = ggx(*unit, 0.16 / aspect, 0.16 * aspect, np.array([0.9, 0.6, 0.3]), [0.1, 0.1, 0.1])
-    np.testing.assert_allclose(source.eval(wi, wo), expected, rtol=3e-5)
+    np.testing.assert_allclose(source.eval(wi, wo), expected, rtol=4e-6)  # worst seen 1.3e-6; x 3
 
 
 @pytest.mark.parametrize(
@@ -126,7 +126,7 @@ def test_ggx_matches_the_textbook(pair):
 def test_analytic_sources_are_reciprocal(pair, spec):
     wi, wo = pair
     source = open_brdf(f"analytic:{spec}")
-    np.testing.assert_allclose(source.eval(wi, wo), source.eval(wo, wi), rtol=2e-5)
+    np.testing.assert_allclose(source.eval(wi, wo), source.eval(wo, wi), rtol=6e-6)  # worst seen 2e-6; x 3
 
 
 def test_ggx_albedo_is_known_at_full_roughness(rng):

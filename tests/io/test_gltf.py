@@ -4,8 +4,8 @@ import json
 
 import numpy as np
 import pytest
-from tiny_gltf import TRIANGLE, TinyGltf, pack_glb
 
+from tests.tiny_gltf import TRIANGLE, TinyGltf, pack_glb
 from warp_neumat.io.gltf import load_gltf
 
 QUAD = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0], [0, 2, 0]], np.float32)

@@ -47,7 +47,7 @@ def test_forward_matches_float64(rng, frame, shape):
     got = stored.evaluate(wi, wo)
     assert (got[5:12] == 0).all()
     assert expected.max() > 1
-    # Worst seen 3e-5 at nside 32, a random table being rough: weights are exact to about 3e-7 nside. x 3.
+    # Worst of 10⁵ pairs 3.2e-5 at nside 32, a random table being rough: weights are exact to about 3e-7 nside. x 3.
     assert (np.abs(got - expected) / (1 + expected)).max() < 1e-4
 
 
@@ -108,7 +108,8 @@ def test_metric_and_gradient_match_autograd(rng):
     gradient, error = model.gradient(batches, loss)
     torch.testing.assert_close(gradient, expected, rtol=1e-4, atol=1e-5)
     # Every sample touches up to four points of each grid, fewer where it lies on a line between two.
-    assert 4.0 * float(2 * total) < float(error.sum()) < 8.001 * float(2 * total)
+    total = 2.0 * float(total.detach())
+    assert 4.0 * total < float(error.sum()) < 8.001 * total
 
     def residuals(table):
         bag = torch.nn.functional.embedding_bag

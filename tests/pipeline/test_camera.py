@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from warp_neumat.pipeline.camera import Camera, bounding_sphere, load_camera, orbit
+from warp_neumat.pipeline.camera import Camera, load_camera, orbit
 
 LO, HI = np.array([-1.0, 0.0, -2.0]), np.array([1.0, 3.0, 2.0])
 SIZE = {"width": 320, "height": 180}

@@ -5,8 +5,8 @@ import sys
 
 import numpy as np
 import pytest
-from tiny_gltf import TRIANGLE, TinyGltf
 
+from tests.tiny_gltf import TRIANGLE, TinyGltf
 from warp_neumat.pipeline.sequence import MeshSequence
 
 QUARTER_Y = [0.0, 0.5**0.5, 0.0, 0.5**0.5]

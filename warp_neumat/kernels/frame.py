@@ -11,7 +11,7 @@ wp.set_module_options(dispatch.module_options())
 
 @wp.func
 def safe_normalize(v: wp.vec3) -> wp.vec3:
-    """Return ``v`` at unit length, also where its square leaves float32's range; +z where it is zero, infinite or NaN."""
+    """Return ``v`` at unit length, also where its square leaves float32's range; +z where it is 0, infinite or NaN."""
     big = wp.max(wp.max(wp.abs(v[0]), wp.abs(v[1])), wp.abs(v[2]))
     # max() passes over a NaN, so each component is compared with itself.
     usable = big > 0.0 and big <= 3.4028235e38 and v[0] == v[0] and v[1] == v[1] and v[2] == v[2]
@@ -35,7 +35,7 @@ def tangent_of(n: wp.vec3) -> wp.vec3:
 
 @wp.func
 def frame_tangent(n: wp.vec3, t: wp.vec3) -> wp.vec3:
-    """Return ``t`` made orthogonal to the unit normal ``n``, at unit length; any tangent of ``n`` where that vanishes."""
+    """Return ``t`` made orthogonal to the unit normal ``n``, at unit length; any tangent of ``n`` where it vanishes."""
     p = t - n * wp.dot(n, t)
     length2 = wp.dot(p, p)
     usable = length2 > 1.0e-12

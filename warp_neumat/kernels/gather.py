@@ -3,7 +3,8 @@
 The atlas guarantees that the four texels around any point of a chart belong to that chart (``pipeline/atlas.py``), so a
 plain bilinear fetch never reads another chart.
 
-``blank`` remembers which blocks of the picture hold nothing but background, so that those which stay empty cost no writes.
+``blank`` remembers which blocks of the picture hold nothing but background, so that those which stay empty cost no
+writes.
 """
 
 import warp as wp

@@ -77,7 +77,8 @@ def pack(weights, biases) -> np.ndarray:
         w, b = np.asarray(w, np.float32), np.asarray(b, np.float32)
         if w.ndim != 2 or w.shape[1] != width or b.shape != (w.shape[0],):
             raise ValueError(
-                f"weights[{layer}] must have shape [out, {width}] and biases[{layer}] [out], got {w.shape} and {b.shape}"
+                f"weights[{layer}] must have shape [out, {width}] and biases[{layer}] [out], "
+                f"got {w.shape} and {b.shape}"
             )
         parts += [b, w.T.ravel()]
         width = w.shape[0]

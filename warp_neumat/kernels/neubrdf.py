@@ -1,10 +1,10 @@
 """NeuBRDF evaluation (paper [neubrdf], Eq. 1–3): spherical index grids, a codebook, and a small network.
 
-A direction selects the four corners of its HEALPix pixel; each corner's index selects a codeword; the weighted sum is the
-direction's feature. The features of ω_i and ω_o together enter the network. Here the first layer is *folded into the
-codebook*: with ψ = Σ w_t D[S[p_t]], the product W₁ψ equals Σ w_t (W₁D)[S[p_t]], so rows of W₁D, one table for each
-direction, are summed instead, and a quarter of the network's multiplications disappear. What depends on ω_o is computed
-once for all lights.
+A direction selects the four corners of its HEALPix pixel; each corner's index selects a codeword; the weighted sum is
+the direction's feature. The features of ω_i and ω_o together enter the network. Here the first layer is *folded into
+the codebook*: with ψ = Σ w_t D[S[p_t]], the product W₁ψ equals Σ w_t (W₁D)[S[p_t]], so rows of W₁D, one table for
+each direction, are summed instead, and a quarter of the network's multiplications disappear. What depends on ω_o is
+computed once for all lights.
 
 Evaluation is written for a block of ``L`` lanes and in two calls: :attr:`Functions.view` once, :attr:`Functions.light`
 for each light, over a list of active lanes only; lanes without work cost nothing. Rows (one lane's hidden units) lie
@@ -80,9 +80,9 @@ def fold(codebook, weights, biases) -> tuple[np.ndarray, np.ndarray, np.ndarray]
         weights: Weight matrices [out, in] of all layers; the first has 2k inputs, ω_i's feature before ω_o's.
         biases: Bias vectors of all layers.
 
-    Returns: table_i [codes, H₁]; table_o [codes, H₁] including the first bias (corner weights sum to one); and the packed
-        further layers: per hidden layer biases [H], transposed weights [H_in, H]; then the output's biases [3] and
-        weights [3, H]. All float32, hidden widths padded with zeros; the folding itself is done in float64.
+    Returns: table_i [codes, H₁]; table_o [codes, H₁] including the first bias (corner weights sum to one); and the
+        packed further layers: per hidden layer biases [H], transposed weights [H_in, H]; then the output's biases [3]
+        and weights [3, H]. All float32, hidden widths padded with zeros; the folding itself is done in float64.
     """
     d, k = np.asarray(codebook, np.float64), codebook.shape[1]
     first, hidden = np.asarray(weights[0], np.float64), padded(weights[0].shape[0])
@@ -115,10 +115,12 @@ def _vector_code(layout: Layout, lanes: int, *, vector: int, rows: int, vectors:
         f"alignas(64) float h0[{rows * max(layout.rows)}]; alignas(64) float h1[{rows * max(layout.rows)}];",
         f"for (int a = 0; a < count; a += {rows}) {{ int lane[{rows}];",
         # The last group repeats its last lane: the same values are written twice.
-        f"for (int r = 0; r < {rows}; ++r) {{ const int l = active.data[a + r < count ? a + r : count - 1]; lane[r] = l;",
+        f"for (int r = 0; r < {rows}; ++r) {{",
+        "const int l = active.data[a + r < count ? a + r : count - 1]; lane[r] = l;",
         "const float* t[4]; float c[4];",
-        f"for (int q = 0; q < 4; ++q) {{ t[q] = table.data + {first} * (long long)index.data[place.data[q * {lanes} + l]];"
-        f" c[q] = corner.data[q * {lanes} + l]; }}",
+        "for (int q = 0; q < 4; ++q) {",
+        f"t[q] = table.data + {first} * (long long)index.data[place.data[q * {lanes} + l]];",
+        f"c[q] = corner.data[q * {lanes} + l]; }}",
         f"const float* base = view.data + l * {first};",
         f"for (int j = 0; j < {first}; j += NV) {{ V v = *(const V*)(base + j);"
         " for (int q = 0; q < 4; ++q) v += *(const V*)(t[q] + j) * c[q];"
@@ -161,7 +163,8 @@ def _scalar_code(layout: Layout) -> str:
     text = [
         f"float h0[{widest}]; float h1[{widest}];",
         f"for (int j = 0; j < {first}; ++j) {{ float v = view.data[j];"
-        f" for (int q = 0; q < 4; ++q) v += table.data[{first} * (long long)index.data[place.data[q]] + j] * corner.data[q];"
+        " for (int q = 0; q < 4; ++q)"
+        f" v += table.data[{first} * (long long)index.data[place.data[q]] + j] * corner.data[q];"
         " h0[j] = v > 0.0f ? v : 0.0f; }",
     ]
     source, offset, width = 0, 0, first
@@ -186,8 +189,8 @@ def functions(layout: Layout, lanes: int) -> types.SimpleNamespace:
     """Return the Warp functions that evaluate a material of ``layout`` for a block of ``lanes`` lanes.
 
     - ``view(grid, wo, scratch)``: takes the local ω_o, [3][L], of all lanes;
-    - ``light(grid, wi, active, count, scratch, value)``: takes the local ω_i, [3][L], and writes the BRDF [1/sr] without
-      the cosine, [3][L], for the first ``count`` lanes listed in ``active``.
+    - ``light(grid, wi, active, count, scratch, value)``: takes the local ω_i, [3][L], and writes the BRDF [1/sr]
+      without the cosine, [3][L], for the first ``count`` lanes listed in ``active``.
 
     Directions must be unit with z ≥ 0: the caller lists only lanes above the horizon.
     """
@@ -198,7 +201,8 @@ def functions(layout: Layout, lanes: int) -> types.SimpleNamespace:
         for (int l = 0; l < {L}; ++l) {{
             const float* t[4]; float c[4];
             for (int q = 0; q < 4; ++q) {{
-                t[q] = table.data + {H1} * (long long)index.data[place.data[q * {L} + l]]; c[q] = corner.data[q * {L} + l];
+                t[q] = table.data + {H1} * (long long)index.data[place.data[q * {L} + l]];
+                c[q] = corner.data[q * {L} + l];
             }}
             float* out = view.data + l * {H1};
             for (int j = 0; j < {H1}; ++j) out[j] = t[0][j] * c[0] + t[1][j] * c[1] + t[2][j] * c[2] + t[3][j] * c[3];

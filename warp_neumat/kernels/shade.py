@@ -1,12 +1,12 @@
 """Shading of surface samples from a work list of 2×2 quads, under point lights (MobileVR §4.2).
 
-A *sample image* says which point of the mesh each of its texels stands for: a triangle id (−1 = none) and the weights of
-the triangle's second and third vertex. The atlas is one, the camera raster another, so texture-space and screen-space
-shading are the same kernel. A quad is named by its column and row in one word (:data:`QUAD_SHIFT`).
+A *sample image* says which point of the mesh each of its texels stands for: a triangle id (−1 = none) and the weights
+of the triangle's second and third vertex. The atlas is one, the camera raster another, so texture-space and
+screen-space shading are the same kernel. A quad is named by its column and row in one word (:data:`QUAD_SHIFT`).
 
-A block holds the texels of 64 quads. Position, normal and the local ω_o are computed once per texel; each light adds its
-share for the lanes it reaches, and a light below a lane's horizon costs that lane nothing. Radiance leaves as float16,
-RGB and coverage, because the gather is bound by the bytes it reads.
+A block holds the texels of 64 quads. Position, normal and the local ω_o are computed once per texel; each light adds
+its share for the lanes it reaches, and a light below a lane's horizon costs that lane nothing. Radiance leaves as
+float16, RGB and coverage, because the gather is bound by the bytes it reads.
 """
 
 import functools

@@ -1,8 +1,9 @@
-"""What has to be shaded: facing triangles, seen texels, and the compacted list of 2×2 quads (DESIGN: skip, then speed up).
+"""What has to be shaded: facing triangles, seen texels, and the compacted list of 2×2 quads (DESIGN: skip, then speed
+up).
 
-Seen means read: a texel is marked when the bilinear footprint of a visible pixel covers it, so the list holds exactly what
-the gather is about to read. Each quad remembers the epoch it was last shaded in; quads of the current epoch are left out,
-which is both the reuse over frames and the repair of what comes into view in between.
+Seen means read: a texel is marked when the bilinear footprint of a visible pixel covers it, so the list holds exactly
+what the gather is about to read. Each quad remembers the epoch it was last shaded in; quads of the current epoch are
+left out, which is both the reuse over frames and the repair of what comes into view in between.
 """
 
 import warp as wp
@@ -71,9 +72,9 @@ def mark_facing_kernel(
     """Mark every texel whose triangle faces the eye, or every texel with a material."""
     b = first + wp.tid()
     for i in range(b * per_block, wp.min((b + 1) * per_block, texel_count)):
-        if texel_material[i] != wp.uint8(0):
-            if backfacing_too != 0 or side[wp.max(triangle[i], 0)] != wp.int8(0):
-                seen[i] = wp.uint8(1)
+        wanted = backfacing_too != 0 or side[wp.max(triangle[i], 0)] != wp.int8(0)
+        if wanted and texel_material[i] != wp.uint8(0):
+            seen[i] = wp.uint8(1)
 
 
 @wp.func
@@ -142,8 +143,8 @@ def pixel_material_kernel(
         texel_material[i] = wp.uint8(m)
 
 
-# One row of quads. Most quads are empty, so eight bytes of either texel row are tested at once. A texel outside an image
-# of odd size reads as 0. With `fill`, the cursors are positions in `quads`; without, they count.
+# One row of quads. Most quads are empty, so eight bytes of either texel row are tested at once. A texel outside an
+# image of odd size reads as 0. With `fill`, the cursors are positions in `quads`; without, they count.
 _ROW = """
     const int columns = (width + 1) >> 1;
     const int y = 2 * row;

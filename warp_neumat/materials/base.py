@@ -16,8 +16,8 @@ KINDS = {"neubrdf": "warp_neumat.materials.neubrdf:NeuBRDF"}
 class Material(abc.ABC):
     """A fitted material on one device.
 
-    Frames, units and the cosine are those of docs/conventions.md: ω_i to the light, ω_o to the viewer, both unit, local,
-    z = shading normal; :meth:`eval` returns value × cosine.
+    Frames, units and the cosine are those of docs/conventions.md: ω_i to the light, ω_o to the viewer, both unit,
+    local, z = shading normal; :meth:`eval` returns value × cosine.
     """
 
     kind: str

@@ -2,8 +2,8 @@
 
 What :mod:`warp_neumat.training` relies on, of a module: ``DATA`` (kind of source), ``configure(source, options) ->
 config``, ``build(config, seed) -> model``, ``from_asset(tensors, config) -> model``, ``DEFAULT_STEPS``; of a model (a
-``torch.nn.Module``): ``prepare(samples) -> batch``, ``predict(batch)``, ``stages()``, ``trainable(stage)``, ``begin``,
-``enter``, ``event``, ``to_asset()``, ``statistics()`` and ``evaluate(*inputs)``;
+``torch.nn.Module``): ``prepare(samples) -> batch``, ``predict(batch)``, ``event_samples()``, ``stages()``,
+``trainable(stage)``, ``begin``, ``enter``, ``event``, ``to_asset()``, ``statistics()`` and ``evaluate(*inputs)``;
 :class:`warp_neumat.models.neubrdf.NeuBRDF` says what each does.
 """
 

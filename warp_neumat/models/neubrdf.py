@@ -81,8 +81,9 @@ class NeuBRDFConfig:
 def configure(source, options: dict) -> NeuBRDFConfig:
     """Return the config for ``source``: ``options`` over the defaults.
 
-    Isotropic sources get the isotropic frame and nside 32: with the paper's 64, 512 primitives are too few for the
-    points, and a file of twice the size shows twice the error (alum-bronze, same steps).
+    Isotropic sources get the isotropic frame and nside 32. Alum-bronze, 2400 steps: sphere MAE 0.0050 with the paper's
+    64 (85 kB: 512 primitives are too few for its points) and 0.0030 with 32 (44 kB). 1600 steps at nside 32: chrome
+    0.0024 in the isotropic and 0.0073 in the absolute frame.
 
     Raises:
         ValueError: If an option is unknown (names the nearest) or out of range.
@@ -206,8 +207,7 @@ class NeuBRDF(nn.Module):
             corner, table = self.indices[corner], self._value(self.codebook)
         else:
             table = self.table
-        bags = embedding_bag(corner, table, mode="sum", per_sample_weights=weight)
-        return bags.view(-1, 2 * self.config.features)
+        return ops.grid_gather(table, corner, weight).view(-1, 2 * self.config.features)
 
     def decode(self, psi: torch.Tensor) -> torch.Tensor:
         """Return y = log(1 + f), (B, 3), of [ψ_i, ψ_o]."""
@@ -223,7 +223,8 @@ class NeuBRDF(nn.Module):
     def forward(self, wi: torch.Tensor, wo: torch.Tensor) -> torch.Tensor:
         """Return the BRDF in 1/sr without the cosine, (N, 3); 0 below the horizon.
 
-        Error: see tests/models/test_neubrdf.py::test_forward_matches_float64.
+        Error: at most 1e-4 of 1 + f against the float64 reference, held by test_forward_matches_float64; seen 8e-5 on a
+        fitted metal with a peak of 800.
         """
         above = (wi[:, 2:] > 0) & (wo[:, 2:] > 0)
         zenith = wi.new_tensor([0.0, 0.0, 1.0])  # stands in below the horizon, where the grids end

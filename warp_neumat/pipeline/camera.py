@@ -165,7 +165,7 @@ _FILL = 0.9  # of the picture's width or height, by the default orbit
 
 
 def _fitting_distance(points, centre, elevation: float, fill: float, aspect: float) -> float:
-    """The nearest distance at which ``points`` lie within tan ``fill`` (× ``aspect``) of the axis, from all azimuths."""
+    """The nearest distance at which ``points`` lie within ``fill`` (× ``aspect``) of the axis, from all azimuths."""
     offset = np.asarray(points, np.float64) - centre
     angle = np.linspace(0.0, 2.0 * math.pi, 128, endpoint=False)
     level, height = math.cos(elevation) * np.ones_like(angle), math.sin(elevation)

@@ -1,9 +1,10 @@
 """Renders mesh sequences with fitted materials, shading in texture space and reusing it over frames (MobileVR §4.2).
 
-A frame passes the stages ``pose`` (animation and upload), ``visibility`` (camera raster), ``mark`` (which texels the picture
-will read), ``list`` (compaction into 2×2 quads by material), ``shade``, and ``gather`` (the picture from the radiance
-texture). With interval N, every (N + 1)th frame starts a new epoch, in which all that is seen is shaded anew; the N
-frames after it only shade what they see and the epoch has not shaded yet, so what comes into view is never a hole.
+A frame passes the stages ``pose`` (animation and upload), ``visibility`` (camera raster), ``mark`` (which texels the
+picture will read), ``list`` (compaction into 2×2 quads by material), ``shade``, and ``gather`` (the picture from the
+radiance texture). With interval N, every (N + 1)th frame starts a new epoch, in which all that is seen is shaded anew;
+the N frames after it only shade what they see and the epoch has not shaded yet, so what comes into view is never a
+hole.
 
 In screen space, the same shading kernel runs on the camera raster itself, every pixel of every frame: the reference.
 """

@@ -1,0 +1,254 @@
+"""The renderer on small scenes: against float64 shading, and what reuse and each skip save."""
+
+import numpy as np
+import pytest
+
+from tests.fake_assets import random_neubrdf
+from warp_neumat.materials.neubrdf import NeuBRDF
+from warp_neumat.pipeline.atlas import Atlas
+from warp_neumat.pipeline.camera import Camera, CameraPath
+from warp_neumat.pipeline.lights import PointLights
+from warp_neumat.pipeline.renderer import SKIPS, Renderer
+from warp_neumat.pipeline.sequence import MeshSequence
+from warp_neumat.reference import shade as reference
+from warp_neumat.reference.neubrdf import reference_eval
+
+SIZE = (97, 61)  # odd, so that the last quads are cut
+
+
+class Still(CameraPath):
+    """One camera for every frame."""
+
+    def __init__(self, eye, target=(0, 0, 0), fov=0.7, size=SIZE):
+        self._camera = Camera.look_at(eye, target, fov_y=fov, width=size[0], height=size[1], near=0.1, far=100.0)
+
+    def at(self, frame):
+        return self._camera
+
+
+class Turning(CameraPath):
+    """A camera that runs around the origin, quickly."""
+
+    def at(self, frame):
+        angle = 0.5 * frame
+        eye = (4 * np.sin(angle), 1.0, 4 * np.cos(angle))
+        return Camera.look_at(eye, (0, 0, 0), fov_y=0.7, width=SIZE[0], height=SIZE[1], near=0.1, far=100.0)
+
+
+def _dome(rows=16, columns=32, radius=1.0, lower=0.95):
+    """Return points, faces and uv of a sphere without its poles: smooth normals, one chart."""
+    v, u = np.meshgrid(np.linspace(1 - lower, lower, rows + 1), np.linspace(0, 1, columns + 1), indexing="ij")
+    theta, phi = np.pi * v, 2 * np.pi * u
+    points = radius * np.stack([np.sin(theta) * np.sin(phi), np.cos(theta), np.sin(theta) * np.cos(phi)], -1)
+    i, j = np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij")
+    a = (i * (columns + 1) + j).ravel()
+    faces = np.concatenate(
+        [np.stack([a, a + columns + 1, a + 1], 1), np.stack([a + 1, a + columns + 1, a + columns + 2], 1)]
+    )
+    return points.reshape(-1, 3).astype(np.float32), faces.astype(np.int32), np.stack([u, v], -1).reshape(-1, 2)
+
+
+@pytest.fixture(scope="module")
+def sphere():
+    points, faces, uv = _dome()
+    return MeshSequence.from_arrays(points, faces, uv, name="sphere")
+
+
+@pytest.fixture(scope="module")
+def asset():
+    """A smooth random material: few codewords and small weights, so that neighbouring texels differ little."""
+    tensors, header = random_neubrdf(np.random.default_rng(3), nside=2, bits=3)
+    tensors["codebook"] = (0.25 * tensors["codebook"].astype(np.float32)).astype(np.float16)
+    return tensors, header
+
+
+@pytest.fixture(scope="module")
+def material(asset):
+    return NeuBRDF(*asset)
+
+
+@pytest.fixture(scope="module")
+def atlas(sphere, tmp_path_factory):
+    return Atlas.build(sphere, 128, cache=tmp_path_factory.mktemp("cache"))
+
+
+LIGHTS = PointLights(
+    np.array([[2.0, 3.0, 2.0], [-3.0, 1.0, 1.0], [0.0, -4.0, 2.0]]), np.array([[30.0, 28, 25], [8, 10, 14], [3, 5, 3]])
+)
+
+
+def _renderer(sphere, material, **options):
+    shot = {"size": SIZE, "camera": Still((1.0, 1.5, 4.0)), "lights": LIGHTS, "cache": False} | options
+    shot.pop("cache")
+    return Renderer(sphere, {"*": material}, **shot)
+
+
+def test_screen_space_matches_float64(sphere, asset, material):
+    renderer = _renderer(sphere, material, space="screen", background=(0.25, 0.5, 0.75))
+    frame = renderer.frame(0)
+    triangle = renderer.raster.triangle.numpy()
+    weights = renderer.raster.barycentric.numpy().astype(np.float64)
+    covered = triangle >= 0
+    assert covered.sum() > 1000
+    b1, b2 = weights[covered].T
+    mesh = sphere.frame(0)
+    corners = sphere.faces[triangle[covered]]
+    tensors, header = asset
+    expected = reference.shade(
+        mesh.points[corners],
+        mesh.normals[corners],
+        mesh.tangents[corners],
+        np.stack([1 - b1 - b2, b1, b2], axis=1),
+        renderer.camera.at(0).eye,
+        *LIGHTS.at(0),
+        lambda wi, wo: reference_eval(tensors, header["config"], wi, wo),
+    )
+    got = frame.image[covered]
+    assert expected.max() > 0.3
+    # Radiance is stored as float16: half an ulp is 4.9e-4 of the value. Worst seen beyond that: 3e-5.
+    assert (np.abs(got - expected) <= 5e-4 * expected + 2e-4).all()
+    assert (frame.image[~covered] == np.float32([0.25, 0.5, 0.75])).all()
+    assert frame.stats["texels"]["shaded"] == covered.sum()
+
+
+def test_texture_space_without_reuse_is_close_to_screen_space(sphere, material, atlas):
+    ours = _renderer(sphere, material, atlas=atlas, interval=0).frame(0).image.copy()
+    screen = _renderer(sphere, material, space="screen").frame(0).image
+    inside = screen.sum(2) > 0
+    error = np.abs(ours - screen).max(2)
+    assert np.median(error[inside]) < 0.02 * screen.max()
+    assert error.mean() < 0.01 * screen.max()
+
+
+def test_the_gather_reads_no_texel_that_was_not_shaded(sphere, material, atlas):
+    renderer = _renderer(sphere, material, atlas=atlas, interval=3, camera=Turning())
+    renderer.shader.radiance.assign(np.full(renderer.shader.radiance.shape, np.nan, np.float16))
+    for k in range(8):  # the camera turns by half a radian a frame: much comes into view within an epoch
+        frame = renderer.frame(k)
+        assert np.isfinite(frame.image).all(), f"frame {k} reads texels that nobody shaded"
+        assert frame.stats["updated"] == (k % 4 == 0)
+
+
+def test_reuse_shades_only_what_comes_into_view(sphere, material, atlas):
+    renderer = _renderer(sphere, material, atlas=atlas, interval=2)
+    frames = [renderer.frame(0) for _ in range(1)]
+    first = frames[0].image.copy()
+    evaluations = [frames[0].stats["evaluations"]]
+    for _ in range(5):
+        frame = renderer.frame(0)
+        evaluations.append(frame.stats["evaluations"])
+        assert np.array_equal(frame.image, first)  # nothing moves, so the picture stays
+    assert evaluations[0] > 0
+    assert evaluations == [evaluations[0], 0, 0, evaluations[0], 0, 0]
+
+
+def test_evaluations_follow_what_is_seen(sphere, material, atlas):
+    near, far = (
+        _renderer(sphere, material, atlas=atlas, interval=0, camera=Still(eye)).frame(0).stats
+        for eye in ((0, 0, 4.0), (0, 0, 14.0))
+    )
+    seen = far["texels"]["seen"] / near["texels"]["seen"]
+    assert seen < 0.3
+    assert far["texels"]["owned"] == near["texels"]["owned"]
+    # A footprint of 2×2 texels touches at most four quads; the texels around it are shaded too.
+    assert 0.5 * seen < far["evaluations"] / near["evaluations"] < 3.0 * seen
+    away = (
+        _renderer(sphere, material, atlas=atlas, interval=0, camera=Still((0, 0, 4.0), target=(0, 0, 9))).frame(0).stats
+    )
+    assert away["evaluations"] == 0
+
+
+def test_skips_nest_and_change_no_pixel(sphere, material, atlas):
+    shots = {}
+    for skip in (SKIPS, ("unowned", "backfacing"), ("unowned",), ()):
+        frame = _renderer(sphere, material, atlas=atlas, interval=0, skip=skip).frame(0)
+        shots[skip] = (frame.image.copy(), frame.stats)
+    pictures = [picture for picture, _ in shots.values()]
+    for picture in pictures[1:]:
+        assert np.array_equal(picture, pictures[0])
+    texels = [stats["texels"] for _, stats in shots.values()]
+    shaded = [t["shaded"] for t in texels]
+    assert shaded[0] < shaded[1] < shaded[2] < shaded[3] == 128 * 128
+    assert texels[0]["owned"] > texels[0]["facing"] > texels[0]["seen"]
+    assert shaded[2] == texels[0]["owned"]
+    assert shaded[0] >= texels[0]["seen"]
+
+
+def test_a_light_below_every_horizon_costs_nothing(sphere, material, atlas):
+    inside = PointLights(np.array([[0.0, 0.0, 0.0]]), np.array([[5.0, 5.0, 5.0]]))
+    frame = _renderer(sphere, material, atlas=atlas, lights=inside).frame(0)
+    assert frame.stats["evaluations"] == 0
+    assert frame.image.max() == 0.0
+
+
+def test_light_falls_off_with_the_square_of_its_distance(sphere, material):
+    def peak(distance):
+        lights = PointLights(np.array([[0.0, 0.0, distance]]), np.array([[100.0, 100, 100]]))
+        return _renderer(sphere, material, space="screen", lights=lights, camera=Still((0, 0, 4.0))).frame(0).image
+
+    centre = np.s_[28:33, 45:52]
+    near, far = peak(11.0)[centre].mean(), peak(21.0)[centre].mean()  # 10 and 20 from the surface
+    assert near / far == pytest.approx(4.0, rel=0.03)
+
+
+def test_two_materials_each_shade_their_own_faces(material, tmp_path):
+    points, faces, uv = _dome(8, 16)
+    both = np.concatenate([points - [1.1, 0, 0], points + [1.1, 0, 0]]).astype(np.float32)
+    pair = MeshSequence.from_arrays(
+        both,
+        np.concatenate([faces, faces + len(points)]),
+        np.concatenate([uv, uv]),
+        face_mesh=np.repeat([0, 1], len(faces)),
+        mesh_names=["left", "right"],
+    )
+    dark_tensors, dark_header = random_neubrdf(np.random.default_rng(3), nside=2, bits=3)
+    dark_tensors["weight2"][...] = 0
+    dark_tensors["bias2"][...] = 0  # exp(0) - 1: a perfectly black material
+    options = {"atlas": Atlas.build(pair, 128, cache=tmp_path), "lights": LIGHTS, "size": (96, 48), "interval": 0}
+    camera = Still((0, 0, 6.0), size=(96, 48))
+    materials = {"*": material, "right": NeuBRDF(dark_tensors, dark_header)}
+    for space in ("texture", "screen"):
+        frame = Renderer(pair, materials, camera=camera, space=space, **options).frame(0)
+        assert frame.image[:, :48].max() > 0.1
+        assert frame.image[:, 48:].max() == 0.0
+        assert frame.stats["evaluations"] > 0
+    with pytest.raises(ValueError, match="no material for 'right'; name one"):
+        Renderer(pair, {"left": material}, camera=camera, **options)
+    with pytest.raises(ValueError, match="no mesh or material matches 'middle'"):
+        Renderer(pair, {"middle": material}, camera=camera, **options)
+
+
+def test_double_sided_surfaces_are_lit_from_both_sides(material):
+    quad = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], np.float32)
+    faces, uv = np.array([[0, 1, 2], [0, 2, 3]]), np.array([[0, 1], [1, 1], [1, 0], [0, 0]])
+    lights = PointLights(np.array([[0.5, 0.5, -3.0]]), np.array([[20.0, 20, 20]]))
+    behind = Still((0.3, 0.2, -4.0))
+    means = []
+    for double in (False, True):
+        sheet = MeshSequence.from_arrays(quad, faces, uv, double_sided=double)
+        renderer = Renderer(sheet, {"*": material}, camera=behind, lights=lights, size=SIZE, atlas=64)
+        means.append(renderer.frame(0).image.mean())
+    assert means[0] == 0.0
+    assert means[1] > 0.01
+
+
+def test_bad_options_are_named(sphere, material):
+    with pytest.raises(ValueError, match="interval must be a whole number"):
+        _renderer(sphere, material, interval=-1)
+    with pytest.raises(ValueError, match='space must be "texture" or "screen"'):
+        _renderer(sphere, material, space="time")
+    with pytest.raises(ValueError, match="skip must be among unowned, backfacing, unseen, got invisible"):
+        _renderer(sphere, material, skip=("invisible",))
+
+
+def test_changing_the_worker_count_between_frames_changes_nothing(sphere, material, atlas):
+    from warp_neumat.kernels import dispatch
+
+    renderer = _renderer(sphere, material, atlas=atlas, interval=0)
+    first = renderer.frame(0).image.copy()
+    try:
+        for workers in (1, 3):
+            dispatch.set_worker_count(workers)
+            assert np.array_equal(renderer.frame(0).image, first)
+    finally:
+        dispatch.set_worker_count(None)
