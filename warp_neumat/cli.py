@@ -35,6 +35,7 @@ def _progress(title: str):
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+    console = Console(stderr=True)
     columns = [
         "{task.description}",
         BarColumn(),
@@ -42,7 +43,8 @@ def _progress(title: str):
         TimeElapsedColumn(),
         TimeRemainingColumn(),
     ]
-    with Progress(*columns, TextColumn("{task.fields[text]}"), console=Console(stderr=True), transient=True) as bar:
+    columns.append(TextColumn("{task.fields[text]}"))
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task(title, total=1.0, text="")
         yield lambda fraction, text="": bar.update(task, completed=fraction, text=text)
 
@@ -106,20 +108,76 @@ def fit(
     source: Annotated[str, typer.Argument(help="FILE.npz:NAME, or analytic:ggx?roughness=0.2&f0=0.9,0.6,0.3")],
     out: Annotated[Path, typer.Option("-o", "--out", help="Asset to write, ending in .neumat.")],
     model: Annotated[str, typer.Option(help="Kind of material: neubrdf.")] = "neubrdf",
-    steps: Annotated[int | None, typer.Option(help="Training steps; default: the model's own.")] = None,
+    preset: Annotated[str | None, typer.Option(help="Length of the fit: quick, standard or fine.")] = None,
+    steps: Annotated[int | None, typer.Option(help="Training steps; default: the preset's.")] = None,
     seed: Annotated[int, typer.Option(help="Same seed, same file.")] = 0,
     resume: Annotated[bool, typer.Option(help="Go on where an interrupted fit of the same output stopped.")] = False,
     device: Device = "cpu",
 ):
-    """Fit a material to a reflectance function and store it as a .neumat asset."""
+    """Fit a material to a reflectance function."""
+    # Threads of torch that spin while they wait cost a busy machine many times what they gain.
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     _warp(device)
     from warp_neumat.training.fit import fit as run
 
     start = time.perf_counter()
     with _progress(f"fit {out.stem}") as progress:
-        header = run(source, out, model=model, steps=steps, seed=seed, resume=resume, device=device, progress=progress)
+        header = run(
+            source,
+            out,
+            model=model,
+            preset=preset,
+            steps=steps,
+            seed=seed,
+            resume=resume,
+            device=device,
+            progress=progress,
+        )
     shown = {k: v for k, v in header.get("metrics", {}).items() if isinstance(v, (int, float))}
     print(f"{out}: {', '.join(f'{k} {v:.4g}' for k, v in shown.items())} ({time.perf_counter() - start:.0f} s)")
+
+
+@app.command("eval")
+def evaluate(
+    asset: Annotated[Path, typer.Argument(help="A .neumat file.")],
+    against: Annotated[str, typer.Option(help="The source, as for fit.")],
+    json_file: Annotated[str | None, typer.Option("--json", help="JSON to this file; - for standard output.")] = None,
+    picture: Annotated[
+        Path | None, typer.Option(help="Write source, asset and ten times their difference on a sphere to this PNG.")
+    ] = None,
+    device: Device = "cpu",
+):
+    """Measure an asset against its source."""
+    _warp(device)
+    from warp_neumat.io.brdf import open_brdf
+    from warp_neumat.materials import load
+    from warp_neumat.training.evaluate import brdf_metrics, sphere_strip
+
+    material, source = load(asset, device=device), open_brdf(against)
+    record = {"kind": material.kind, "bytes": material.bytes, **brdf_metrics(source, material.brdf)}
+    if picture is not None:
+        from warp_neumat.io.image import write_png
+
+        write_png(picture, sphere_strip(source.eval, material.brdf))
+    _write_json(record, json_file)
+    if json_file != "-":
+        print(f"{asset}: " + ", ".join(f"{k} {v:.4g}" for k, v in record.items() if isinstance(v, (int, float))))
+
+
+def _write_json(record: dict, target: str | None) -> None:
+    """Write ``record`` to a file, whole or not at all, or with ``-`` to standard output."""
+    import json
+
+    from warp_neumat.io.atomic import replacing
+
+    if target is None:
+        return
+    text = json.dumps(record, indent=1) + "\n"
+    if target == "-":
+        sys.stdout.write(text)
+        return
+    with replacing(Path(target)) as temporary:
+        temporary.write_text(text, encoding="utf-8")
 
 
 @app.command()
@@ -129,24 +187,14 @@ def info(
         str | None, typer.Option("--json", help="Write the header as JSON to this file; - for standard output.")
     ] = None,
 ):
-    """Show what an asset holds: kind, config, source, metrics, tensors and bytes."""
-    import json
-
+    """Show what an asset holds."""
     from warp_neumat.io.asset import read_asset
 
     tensors, header = read_asset(asset)
     size = sum(t.nbytes for t in tensors.values())
     listed = {n: {"dtype": str(t.dtype), "shape": list(t.shape), "bytes": t.nbytes} for n, t in tensors.items()}
-    record = {**header, "bytes": size, "tensors": listed}
+    _write_json({**header, "bytes": size, "tensors": listed}, json_file)
     if json_file is not None:
-        text = json.dumps(record, indent=1) + "\n"
-        if json_file == "-":
-            sys.stdout.write(text)
-        else:
-            from warp_neumat.io.atomic import replacing
-
-            with replacing(Path(json_file)) as temporary:
-                temporary.write_text(text, encoding="utf-8")
         return
     print(f"{asset}: {header['kind']} version {header['version']}, {size} bytes")
     for part in ("config", "source", "training", "metrics"):
@@ -159,9 +207,13 @@ def info(
 def _shot(sequence, materials, out, *, frames, interval, atlas, lights, camera, size, reference, video, device, **more):
     """Set up a renderer, run the shot with progress bars, and say where everything is."""
     from warp_neumat.pipeline.renderer import Renderer
-    from warp_neumat.pipeline.shot import render_shot
+    from warp_neumat.pipeline.shot import prepare_folder, render_shot
+    from warp_neumat.pipeline.tonemap import check_operator
 
     start = time.perf_counter()
+    prepare_folder(out)
+    check_operator(more["tonemap"])
+    sequence.frame(frames[-1])  # a frame that does not exist shows before the work
     with _progress("atlas") as progress:
         renderer = Renderer(
             sequence,
@@ -177,8 +229,6 @@ def _shot(sequence, materials, out, *, frames, interval, atlas, lights, camera, 
             device=device,
             progress=progress,
         )
-    for note in renderer.atlas.notes:
-        print(f"note: {note}", file=sys.stderr)
     twin = renderer.per_pixel() if reference else None
     setup = {"renderer": 1e3 * (time.perf_counter() - start)}
     with _progress("render") as progress:
@@ -195,6 +245,8 @@ def _shot(sequence, materials, out, *, frames, interval, atlas, lights, camera, 
             setup=setup,
             progress=progress,
         )
+    for note in renderer.atlas.notes:
+        print(f"note: {note}", file=sys.stderr)
     summary = report["summary"]
     line = f"{len(frames)} frames, {summary['ms']:.1f} ms a frame, {summary['evaluations']:.0f} evaluations a frame"
     if reference:
@@ -239,7 +291,7 @@ def render(
     ] = None,
     device: Device = "cpu",
 ):
-    """Render a mesh sequence with fitted materials into frames, a video and a report."""
+    """Render a mesh sequence: frames, video, report."""
     from warp_neumat.pipeline.options import parse_background, parse_skips
 
     options = {k: str(v) if isinstance(v, Path) else v for k, v in locals().items() if not k.startswith("parse_")}
@@ -281,7 +333,7 @@ def demo(
     reference: Annotated[bool, typer.Option(help="Measure every frame against per-pixel shading.")] = True,
     device: Device = "cpu",
 ):
-    """Render the bundled animation with the bundled materials: frames, video, report.html, report.json."""
+    """Render the bundled animation and its report."""
     picture = _size(size)
     _warp(device)
     from warp_neumat.pipeline import demo as bundled

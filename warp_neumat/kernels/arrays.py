@@ -33,6 +33,7 @@ def kind_of(value, device=None) -> Kind:
     if isinstance(value, wp.array):
         return Kind("warp", value.device)
     if _is_torch(value):
+        wp.init()  # device_from_torch does not do it by itself
         return Kind("torch", wp.device_from_torch(value.device))
     return Kind("numpy", wp.get_device(device))
 

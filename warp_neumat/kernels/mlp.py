@@ -205,6 +205,7 @@ def make_rows_kernel(shape: MLPShape, lanes: int):
     """Return a kernel that evaluates ``shape`` for the rows of a matrix, shapes [n, inputs] → [n, outputs]."""
     mlp = make_mlp(shape, lanes)
     I, O, L = shape.inputs, shape.outputs, lanes  # noqa: E741
+    ROW_IN, ROW_OUT = I, O  # a constant that is cast keeps the new type in the rest of the kernel
     FLOAT = wp.constant(wp.uint64(4))
 
     if lanes == 1:  # one row is already a block of one lane
@@ -221,8 +222,8 @@ def make_rows_kernel(shape: MLPShape, lanes: int):
             result: wp.array(dtype=wp.float32),
         ):
             b = first + wp.tid()
-            X = wp.array(ptr=rows.ptr + wp.uint64(b) * wp.uint64(I) * FLOAT, shape=(I,), dtype=wp.float32)
-            Y = wp.array(ptr=result.ptr + wp.uint64(b) * wp.uint64(O) * FLOAT, shape=(O,), dtype=wp.float32)
+            X = wp.array(ptr=rows.ptr + wp.uint64(b) * wp.uint64(ROW_IN) * FLOAT, shape=(I,), dtype=wp.float32)
+            Y = wp.array(ptr=result.ptr + wp.uint64(b) * wp.uint64(ROW_OUT) * FLOAT, shape=(O,), dtype=wp.float32)
             mlp(X, weights, Y)
 
         return mlp_rows_kernel

@@ -308,7 +308,9 @@ def make_eval_kernel(layout: Layout, lanes: int):
     """Return the kernel behind ``Material.eval``: pairs of local directions → BRDF × cosine."""
     evaluate = functions(layout, lanes)
     view, light = evaluate.view, evaluate.light
-    L, WORDS = lanes, layout.scratch(lanes)
+    L = lanes
+    # Two names, because a constant that is cast keeps the new type in the rest of the kernel.
+    TOTAL = STRIDE = layout.scratch(lanes) + 10 * lanes
     FLOAT = wp.constant(wp.uint64(4))
 
     @wp.kernel(**_MODULE)
@@ -324,9 +326,9 @@ def make_eval_kernel(layout: Layout, lanes: int):
         result: wp.array(dtype=wp.float32),
     ):
         b = first + wp.tid()
-        own = scratch.ptr + wp.uint64(slot) * wp.uint64(WORDS + 10 * L) * FLOAT
+        own = scratch.ptr + wp.uint64(slot) * wp.uint64(STRIDE) * FLOAT
         if wp.static(L == 1):
-            local = wp.zeros(shape=(WORDS + 10,), dtype=wp.float32)
+            local = wp.zeros(shape=TOTAL, dtype=wp.float32)
             own = local.ptr
         I = wp.array(ptr=own, shape=(3 * L,), dtype=wp.float32)  # noqa: E741
         O = wp.array(ptr=own + wp.uint64(3 * L) * FLOAT, shape=(3 * L,), dtype=wp.float32)  # noqa: E741

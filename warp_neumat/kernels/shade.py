@@ -73,6 +73,8 @@ def make_shade_kernel(functions_of, layout, lanes: int):
     evaluate = functions_of(layout, lanes)
     view, light = evaluate.view, evaluate.light
     L, OWN = lanes, layout.scratch(lanes)
+    # Two names, because a constant that is cast keeps the new type in the rest of the kernel.
+    TOTAL = STRIDE = OWN + WORDS * L
     FLOAT = wp.constant(wp.uint64(4))
 
     @wp.kernel(module="unique", module_options=dispatch.module_options())
@@ -92,9 +94,9 @@ def make_shade_kernel(functions_of, layout, lanes: int):
         evaluations: wp.array(dtype=wp.int32),
     ):
         b = first + wp.tid()
-        own = scratch.ptr + wp.uint64(slot) * wp.uint64(OWN + WORDS * L) * FLOAT
+        own = scratch.ptr + wp.uint64(slot) * wp.uint64(STRIDE) * FLOAT
         if wp.static(L == 1):
-            local = wp.zeros(shape=(OWN + WORDS,), dtype=wp.float32)
+            local = wp.zeros(shape=TOTAL, dtype=wp.float32)
             own = local.ptr
         P = wp.array(ptr=own, shape=(3 * L,), dtype=wp.float32)
         N = wp.array(ptr=own + wp.uint64(3 * L) * FLOAT, shape=(3 * L,), dtype=wp.float32)

@@ -41,6 +41,11 @@ class Material(abc.ABC):
         Below-horizon pairs give 0; no input gives a NaN or a negative value.
         """
 
+    def brdf(self, wi, wo):
+        """Return the value without the cosine [1/sr] for pairs of directions, shape [n, 3]; 0 below the horizon."""
+        cosine = wi[:, 2:]
+        return self.eval(None, wi, wo) / (cosine + 1e-9 * (cosine <= 0))
+
     @abc.abstractmethod
     def shader(self) -> "Shader":
         """Return what ``kernels.shade`` needs to evaluate this material inside its own loop."""

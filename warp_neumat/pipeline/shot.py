@@ -7,11 +7,26 @@ from pathlib import Path
 import numpy as np
 
 from warp_neumat import machine, metrics
+from warp_neumat.io.atomic import check_writable
 from warp_neumat.io.image import write_exr, write_png
 from warp_neumat.io.video import VideoWriter
 from warp_neumat.pipeline.renderer import Renderer
 from warp_neumat.pipeline.report import write_report
-from warp_neumat.pipeline.tonemap import tonemap
+from warp_neumat.pipeline.tonemap import check_operator, tonemap
+
+
+def prepare_folder(out) -> Path:
+    """Make the folder ``out`` with its ``frames``, and return it.
+
+    Raises: OSError: If that cannot be done or the folder cannot be written; one line.
+    """
+    out = Path(out)
+    try:
+        (out / "frames").mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise type(error)(f"{out}: cannot be made ({error.strerror}); choose a folder that you may write to") from None
+    check_writable(out / "report.json")
+    return out
 
 
 def render_shot(
@@ -52,8 +67,8 @@ def render_shot(
     """
     if not len(frames):
         raise ValueError("there is no frame to render; give a range A:B with B above A")
-    out = Path(out)
-    (out / "frames").mkdir(parents=True, exist_ok=True)
+    out = prepare_folder(out)
+    check_operator(operator)
     if reference is not None:
         (out / "reference").mkdir(exist_ok=True)
         blank = np.zeros((16, 16, 3), np.float32)

@@ -53,6 +53,12 @@ def _table(operator: str) -> np.ndarray:
     return table
 
 
+def check_operator(operator: str) -> None:
+    """Raise ValueError, with the names there are, unless ``operator`` is one of them."""
+    if operator not in OPERATORS:
+        raise ValueError(f"operator must be one of {', '.join(OPERATORS)}, got {operator!r}")
+
+
 def tonemap(linear, exposure: float = 0.0, operator: str = "srgb", *, out=None) -> np.ndarray:
     """Return display values in [0, 1], float32, of a linear picture.
 
@@ -68,8 +74,7 @@ def tonemap(linear, exposure: float = 0.0, operator: str = "srgb", *, out=None) 
     test_tonemap_matches_the_formulas.
     """
     linear = np.ascontiguousarray(linear, dtype=np.float32)
-    if operator not in OPERATORS:
-        raise ValueError(f"operator must be one of {', '.join(OPERATORS)}, got {operator!r}")
+    check_operator(operator)
     if not abs(exposure) <= 60:
         raise ValueError(f"exposure must be between -60 and 60 stops, got {exposure}")
     if out is None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from warp_neumat.training.samplers import measured_directions
-from warp_neumat.training.sphere import render_sphere, sphere_error
+from warp_neumat.training.sphere import render_sphere, sphere_error, tone_map
 
 
 def brdf_metrics(source, eval_fn, *, size: int = 256) -> dict:
@@ -22,3 +22,9 @@ def brdf_metrics(source, eval_fn, *, size: int = 256) -> dict:
     wi, wo = measured_directions(1 << 17, np.random.default_rng(0))
     difference = np.asarray(eval_fn(wi, wo), np.float64) - source.eval(wi, wo)
     return {**error, "mse_raw": float((difference**2).mean())}
+
+
+def sphere_strip(source_fn, asset_fn, *, size: int = 256) -> np.ndarray:
+    """Return source, asset and ten times their difference side by side, display values (size, 3 size, 3) float32."""
+    source, asset = tone_map(render_sphere(source_fn, size)), tone_map(render_sphere(asset_fn, size))
+    return np.concatenate([source, asset, np.minimum(10.0 * np.abs(source - asset), 1.0)], axis=1)

@@ -59,14 +59,16 @@ def fit(
     budget_seconds: float | None = None,
     **config,
 ) -> dict:
-    """Fit ``model`` to ``source``, write the asset to ``out`` and return its header.
+    """Fit ``model`` to ``source``, write the asset to ``out``, and return its header and how long it took.
+
+    The returned ``header["training"]["seconds"]`` is not in the file.
 
     Args:
         source: As for :func:`warp_neumat.io.brdf.open_brdf`.
         out: The ``.neumat`` file to write; replaced if it exists. Its folder must exist.
         model: Name in :data:`warp_neumat.models.REGISTRY`.
         steps: Optimiser steps; default: the model's, times the preset's factor.
-        seed: Same seed, same tensors (on one machine with the same number of threads).
+        seed: Same seed, same file (on one machine with the same number of threads).
         device: torch device.
         preset: One of :data:`PRESETS`.
         resume: Go on from the checkpoint beside ``out`` where there is one.
@@ -108,9 +110,11 @@ def fit(
         size = sum(tensor.nbytes for tensor in tensors.values())
         stored = module.from_asset(tensors, header["config"])
         header["source"] = {"spec": source, "name": opened.name}
+        seconds = facts.pop("seconds")  # returned, but not stored: the same seed gives the same file
         header["training"] = {**facts, **trained.statistics()}
         header["metrics"] = {**kind.metrics(opened, stored.evaluate), "bytes": size}
         write_asset(out, tensors, header)
+        header["training"]["seconds"] = seconds
     finally:
         torch.set_num_threads(threads)
     checkpoint_path(out).unlink(missing_ok=True)

@@ -1,0 +1,48 @@
+"""Every kernel compiles to PTX, which needs no GPU: one source serves both kinds of device."""
+
+import pytest
+import warp as wp
+
+from warp_neumat.kernels import atlas, frame, gather, healpix, mlp, neubrdf, shade, visibility, worklist
+
+
+def _frame():
+    return frame._make_kernels(1)[0].module
+
+
+def _healpix():
+    return healpix._kernels(1).corners.module
+
+
+def _mlp():
+    return mlp.make_rows_kernel(mlp.MLPShape(12, 16, 9), 1).module
+
+
+def _neubrdf():
+    return neubrdf.make_eval_kernel(neubrdf.Layout((64, 64), True), 1).module
+
+
+def _shade():
+    return shade.make_shade_kernel(neubrdf.functions, neubrdf.Layout((64, 64), True), 1).module
+
+
+MODULES = {
+    "frame": _frame,
+    "healpix": _healpix,
+    "mlp": _mlp,
+    "neubrdf": _neubrdf,
+    "shade": _shade,
+    "worklist": lambda: worklist.list_kernel.module,
+    "gather": lambda: gather.gather_kernel.module,
+    "atlas": lambda: wp.get_module(atlas.__name__),
+    "visibility": lambda: wp.get_module(visibility.__name__),
+}
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_kernels_compile_for_cuda(name, tmp_path):
+    wp.init()
+    wp.compile_aot_module(MODULES[name](), arch=80, module_dir=tmp_path, use_ptx=True)
+    code = "".join(f.read_text(errors="replace") for f in tmp_path.glob("*.ptx"))
+    assert ".entry" in code
+    assert "_kernel" in code
