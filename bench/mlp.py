@@ -2,7 +2,7 @@
 
 All run in one process, in turns, on the same number of cores. ``cache``: inputs and outputs stay in the second-level
 cache, so arithmetic decides; ``stream``: 2²⁰ evaluations go through memory, so bytes do. Each peer is given its best
-batch size, found here first, in every data type it has. ``pair`` is MobileVR's coarse network (23→8→8→8→8) followed by
+batch size and data type, found here first. ``pair`` is MobileVR's coarse network (23→8→8→8→8) followed by
 its fine one (24→8→8→8→3), with the coarse outputs among its inputs. ``error`` is the largest deviation from float64
 over the largest output. A GFLOP counts two operations per weight.
 """
@@ -232,14 +232,13 @@ def drjit_peers(problem: Problem, data_rows: int, evaluations: int, workers: int
 
 
 def fastest(peers) -> dict[str, tuple]:
-    """Return for each name its fastest (call, error, evaluations of a call)."""
-    best: dict[str, tuple] = {}
+    """Return the fastest of the offers as {name: (call, error, evaluations of a call)}."""
+    best = None
     for name, call, error, done in peers:
-        call()
-        spent = min(_seconds(call) for _ in range(3)) / done
-        if name not in best or spent < best[name][0]:
-            best[name] = (spent, call, error, done)
-    return {name: rest for name, (_, *rest) in best.items()}
+        spent = min(_seconds(call) for _ in range(3)) / done  # the first of the three warms up
+        if best is None or spent < best[0]:
+            best = (spent, name, call, error, done)
+    return {best[1]: best[2:]}
 
 
 def _seconds(call) -> float:
