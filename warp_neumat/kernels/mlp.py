@@ -107,6 +107,8 @@ def _layer_code(inputs, outputs, *, source, stride, target, target_stride, offse
         text.append(f"for (int r = 0; r < {count}; ++r) {{ const int o = {start} + r * {size};")
         text += [f"V a{b}_{u} = {{}}; a{b}_{u} += w[{bias} + o + {b}];" for b, u in cells]
         text.append(f"const float* wk = w + {weight} + o; const float* xk = {source};")
+        # Four steps at a time: measured 0.74 -> 0.81 of peak for 12-16-9, no difference for wide layers (Zen 3).
+        text.append('_Pragma("clang loop unroll_count(4)")')
         text.append(f"for (int k = 0; k < {inputs}; ++k, wk += {outputs}, xk += {stride}) {{")
         text += [f"const V x{u} = *(const V*)(xk + {u} * NV);" for u in range(vectors)]
         for b in range(size):

@@ -132,6 +132,7 @@ def _vector_code(layout: Layout, lanes: int, *, vector: int, rows: int, vectors:
         text.append(f"for (int o = 0; o < {out}; o += {step}) {{ const float* w = weights.data + {offset + out} + o;")
         cells = [(r, u) for r in range(rows) for u in range(vectors)]
         text += [f"V a{r}_{u} = *(const V*)(weights.data + {offset} + o + {u} * NV);" for r, u in cells]
+        text.append('_Pragma("clang loop unroll_count(4)")')
         text.append(f"for (int k = 0; k < {width}; ++k, w += {out}) {{")
         text += [f"const V w{u} = *(const V*)(w + {u} * NV);" for u in range(vectors)]
         for r in range(rows):
