@@ -174,6 +174,20 @@ def test_skips_nest_and_change_no_pixel(sphere, material, atlas):
     assert shaded[0] >= texels[0]["seen"]
 
 
+def test_laziness_changes_no_pixel(sphere, material, atlas):
+    """What is shaded when it is first seen equals what would have been shaded at the update."""
+    moving = [
+        _renderer(sphere, material, atlas=atlas, interval=3, camera=Turning(), skip=skip)
+        for skip in (SKIPS, ("unowned",))
+    ]
+    for k in range(8):
+        lazy, eager = (renderer.frame(k) for renderer in moving)
+        assert np.array_equal(lazy.image, eager.image)
+    # The eager one did all its work at the updates.
+    assert eager.stats["evaluations"] == 0
+    assert lazy.stats["evaluations"] > 0
+
+
 def test_a_light_below_every_horizon_costs_nothing(sphere, material, atlas):
     inside = PointLights(np.array([[0.0, 0.0, 0.0]]), np.array([[5.0, 5.0, 5.0]]))
     frame = _renderer(sphere, material, atlas=atlas, lights=inside).frame(0)

@@ -2,9 +2,9 @@
 
 A frame passes the stages ``pose`` (animation and upload), ``visibility`` (camera raster), ``mark`` (which texels the
 picture will read), ``list`` (compaction into 2×2 quads by material), ``shade``, and ``gather`` (the picture from the
-radiance texture). With interval N, every (N + 1)th frame starts a new epoch, in which all that is seen is shaded anew;
-the N frames after it only shade what they see and the epoch has not shaded yet, so what comes into view is never a
-hole.
+radiance texture). With interval N, every (N + 1)th frame starts a new epoch: it freezes pose, viewer and lights, and all
+that is seen from then on is shaded as of that frame, when it is first seen. So the radiance texture is the paper's,
+evaluated lazily: what comes into view within an epoch is neither a hole nor newer than its neighbours.
 
 In screen space, the same shading kernel runs on the camera raster itself, every pixel of every frame: the reference.
 """
@@ -197,7 +197,7 @@ class Renderer:
                 [*pixel, self.shader.radiance, side, side, self.background],
                 [blank, self._image.flatten()],
             )
-        self._epoch, self._since = 0, 0
+        self._epoch, self._since, self._frozen = 0, 0, None
 
     def _shader(self, triangle, barycentric, material) -> TexelShader:
         return TexelShader(self.mesh, self.materials, triangle, barycentric, material, len(self.lights))
@@ -228,14 +228,16 @@ class Renderer:
         """Render frame ``index`` as the next picture."""
         clock = _Clock(self.device)
         camera = self.camera.at(index)
-        self.mesh.pose(index)
-        clock.stage("pose")
-        self.raster.run(self.mesh.points, camera.clip())
-        clock.stage("visibility")
         updated = self.space == "screen" or self._since == 0
-        self._epoch += updated
         self._since = 0 if self._since == self.interval else self._since + 1
-        self.mesh.face_to(camera.eye)
+        self.mesh.show(index)
+        if updated:
+            self._epoch += 1
+            self.mesh.freeze(camera.eye)
+            self._frozen = (camera.eye, *self.lights.at(index))
+        clock.stage("pose")
+        self.raster.run(self.mesh.shown, camera.clip())
+        clock.stage("visibility")
         if self.space == "texture":
             self.shader.seen.zero_()
             if "unseen" not in self.skip and updated:
@@ -244,7 +246,7 @@ class Renderer:
         clock.stage("mark")
         counts = self.shader.list(self._epoch)
         clock.stage("list")
-        evaluations = self.shader.shade(camera.eye, *self.lights.at(index))
+        evaluations = self.shader.shade(*self._frozen)
         clock.stage("shade")
         self._show.run()
         image = self._image.numpy()

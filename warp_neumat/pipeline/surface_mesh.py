@@ -1,4 +1,4 @@
-"""A mesh sequence on a device: topology once, points, normals and tangents per frame, materials bound to faces."""
+"""A mesh sequence on a device: topology once, the points that are shown, and the pose that is shaded."""
 
 import numpy as np
 import warp as wp
@@ -46,6 +46,9 @@ def bind_materials(sequence: MeshSequence, assignments: dict[str, Material]) -> 
 class SurfaceMesh:
     """Device arrays of a sequence, updated in place.
 
+    :attr:`shown` are the points the camera sees; :attr:`points`, :attr:`normals`, :attr:`tangents` and :attr:`side` are
+    the pose that is shaded, which stays as it is while radiance is reused.
+
     Args:
         sequence: The mesh sequence.
         face_material: Material index of each face, shape (F,).
@@ -62,11 +65,12 @@ class SurfaceMesh:
 
         self.faces = wp.array(sequence.faces.ravel(), dtype=wp.int32, device=self.device)
         self.face_material = wp.array(face_material, dtype=wp.int32, device=self.device)
+        self.shown = array((count, 3), wp.float32)
         self.points, self.normals = array((count, 3), wp.float32), array((count, 3), wp.float32)
         self.tangents = array((count, 4), wp.float32)
         self.side = array(faces, wp.int8)
         double = wp.array(sequence.face_double_sided.astype(np.uint8), dtype=wp.uint8, device=self.device)
-        self._shown = None
+        self._frame = self._shaded = None
         self._facing = dispatch.Job(
             worklist.facing_kernel,
             dispatch.blocks(faces, _FACES_PER_BLOCK),
@@ -75,23 +79,24 @@ class SurfaceMesh:
             device=self.device,
         )
 
-    def pose(self, index: int) -> bool:
-        """Move the mesh to frame ``index``; return whether that changed anything."""
+    def show(self, index: int) -> None:
+        """Move what the camera sees to frame ``index``."""
         frame = self.sequence.frame(index)
-        if frame is self._shown:
-            return False
-        for name in ("points", "normals", "tangents"):
-            self._write(getattr(self, name), getattr(frame, name))
-        self._shown = frame
-        return True
+        if frame is not self._frame:
+            self._write(self.shown, frame.points)
+            self._frame = frame
+
+    def freeze(self, eye) -> None:
+        """Take the shown frame as the pose that is shaded, and find which triangles face ``eye`` in it."""
+        if self._frame is not self._shaded:
+            for name in ("points", "normals", "tangents"):
+                self._write(getattr(self, name), getattr(self._frame, name))
+            self._shaded = self._frame
+        self._facing.set(4, wp.vec3(*(float(c) for c in eye)))
+        self._facing.run()
 
     def _write(self, target: wp.array, values: np.ndarray) -> None:
         if self.device.is_cpu:
             target.numpy()[...] = values  # a view: one copy, no allocation
         else:
             target.assign(values)
-
-    def face_to(self, eye) -> None:
-        """Find which triangles face ``eye``, into :attr:`side`."""
-        self._facing.set(4, wp.vec3(*(float(c) for c in eye)))
-        self._facing.run()
