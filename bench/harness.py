@@ -1,12 +1,13 @@
 """Timing that a noisy machine cannot tilt: contenders take turns, and each is judged by its median."""
 
 import statistics
+import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 
 from warp_neumat.machine import machine, versions
 
-__all__ = ["interleave", "machine", "versions"]
+__all__ = ["interleave", "machine", "track", "versions"]
 
 
 def interleave(functions: Mapping[str, Callable[[], object]], rounds: int, warmup: int = 1) -> dict[str, float]:
@@ -33,3 +34,12 @@ def interleave(functions: Mapping[str, Callable[[], object]], rounds: int, warmu
             functions[name]()
             seconds[name].append(time.perf_counter() - start)
     return {name: statistics.median(seconds[name]) for name in order}
+
+
+def track(items: Iterable, text: str) -> Iterator:
+    """Yield ``items`` while a bar on stderr, where that is a terminal, shows how far they are."""
+    from rich.console import Console
+    from rich.progress import track as rich_track
+
+    console = Console(stderr=True)
+    return iter(rich_track(items, text, console=console, transient=True, disable=not sys.stderr.isatty()))

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from bench.harness import track
 from warp_neumat import metrics
 from warp_neumat.pipeline.atlas import Atlas
 from warp_neumat.pipeline.demo import material_paths
@@ -41,7 +42,7 @@ def rows(*, device: str, quick: bool, lights: int = 1, material=None, size=(2064
             settings[side, interval] = Renderer(sequence, materials, atlas=atlas, interval=interval, **common)
     stats: dict = {key: [] for key in settings}
     errors: dict = {key: [] for key in settings}
-    for frame in range(frames):
+    for frame in track(range(frames), "all settings, frame by frame"):
         expected = None
         for key, renderer in settings.items():
             rendered = renderer.frame(frame)
@@ -74,5 +75,5 @@ def rows(*, device: str, quick: bool, lights: int = 1, material=None, size=(2064
             "evaluations": mean(key, lambda s: s["evaluations"]),
             "seen": mean(key, lambda s: s["texels"]["seen"]),
             **error,
-            **({} if key == "screen" else {"peer": "screen space", "peer_ms": screen, "ratio": screen / shade}),
+            **({} if key == "screen" else {"peer": "screen", "peer_ms": screen, "ratio": screen / shade}),
         }

@@ -5,46 +5,42 @@ import pytest
 import warp as wp
 
 from warp_neumat.kernels import dispatch
+from warp_neumat.kernels.shade import MASK_SHIFT, ROW_SHIFT
 from warp_neumat.kernels.worklist import drawn, facing_kernel, list_kernel
 
 
-def _expected(seen, material, stamp, epoch):
-    """Return {material: set of (column, row)} and the texels seen and shaded, by looping over quads."""
-    height, width = seen.shape
-    found, seen_count, shaded = {}, 0, 0
-    for row in range(-(-height // 2)):
-        for column in range(-(-width // 2)):
-            texels = np.s_[2 * row : 2 * row + 2, 2 * column : 2 * column + 2]
-            marks = int(seen[texels].sum())
-            seen_count += marks
-            if marks and stamp[row, column] < epoch:
-                shaded += int((material[texels] > 0).sum())
-                for m in set(material[texels].ravel()) - {0}:
-                    found.setdefault(int(m) - 1, set()).add((column, row))
-    return found, seen_count, shaded
+def _expected(seen, material, done):
+    """Return {material: {(column, row): mask}} and the texels seen and listed, by looping over texels."""
+    found, wanted = {}, (seen > 0) & (material > 0) & (done == 0)
+    for y, x in np.argwhere(wanted):
+        quads = found.setdefault(int(material[y, x]) - 1, {})
+        quad = (int(x) // 2, int(y) // 2)
+        quads[quad] = quads.get(quad, 0) | 1 << (2 * (int(y) % 2) + int(x) % 2)
+    return found, int((seen > 0).sum()), int(wanted.sum())
 
 
 @pytest.mark.parametrize("size", [(1, 1), (2, 2), (7, 5), (64, 48), (129, 33), (30, 31)])
 def test_list_matches_a_plain_loop(rng, device, size):
     width, height = size
     material = rng.integers(0, 4, (height, width)).astype(np.uint8)
-    seen = ((rng.random((height, width)) < 0.2) & (material > 0)).astype(np.uint8)
+    seen = ((rng.random((height, width)) < 0.4) * rng.integers(1, 4, (height, width))).astype(np.uint8)
     seen[:, width // 3 : 2 * width // 3] = 0  # a run of empty quads, which is passed over eight texels at a time
-    rows, columns, epoch = -(-height // 2), -(-width // 2), 5
-    stamp = rng.integers(3, 6, (rows, columns)).astype(np.int32)
-    found, seen_texels, shaded_texels = _expected(seen, material, stamp, epoch)
+    done = (rng.random((height, width)) < 0.3).astype(np.uint8)
+    rows, columns = -(-height // 2), -(-width // 2)
+    found, seen_texels, listed_texels = _expected(seen, material, done)
 
     def array(values, dtype):
         return wp.array(np.asarray(values).ravel(), dtype=dtype, device=device)
 
-    stamps, cursor = array(stamp, wp.int32), array(np.zeros(3 * rows), wp.int32)
+    marks, cursor = array(done, wp.uint8), array(np.zeros(3 * rows), wp.int32)
     seen_count, shaded_count = array(np.zeros(rows), wp.int32), array(np.zeros(rows), wp.int32)
     quads = array(np.full(3 * rows * columns, -1), wp.int32)
-    common = [array(seen, wp.uint8), array(material, wp.uint8), width, height, rows, epoch]
-    outputs = [stamps, cursor, seen_count, shaded_count, quads]
+    common = [array(seen, wp.uint8), array(material, wp.uint8), width, height, rows]
+    outputs = [marks, cursor, seen_count, shaded_count, quads]
     dispatch.launch(list_kernel, rows, inputs=[*common, 0], outputs=outputs, device=device)
     assert seen_count.numpy().sum() == seen_texels
-    assert shaded_count.numpy().sum() == shaded_texels
+    assert shaded_count.numpy().sum() == listed_texels
+    assert np.array_equal(marks.numpy().reshape(height, width), done)
     counts = cursor.numpy().copy()
     starts = np.cumsum(counts) - counts
     cursor.assign(starts.astype(np.int32))
@@ -52,11 +48,11 @@ def test_list_matches_a_plain_loop(rng, device, size):
     listed = quads.numpy()
     for m in range(3):
         segment = listed[starts[m * rows] : starts[m * rows] + counts[m * rows : (m + 1) * rows].sum()]
-        words = [(int(w) & 0xFFFF, int(w) >> 16) for w in segment]
-        assert len(words) == len(set(words))
-        assert set(words) == found.get(m, set())
-    fresh = {q for listed_quads in found.values() for q in listed_quads}
-    assert {(int(c), int(r)) for r, c in np.argwhere(stamps.numpy().reshape(rows, columns) != stamp)} == fresh
+        words = {(int(w) & 0x1FFF, int(w) >> ROW_SHIFT & 0x1FFF): int(w) >> MASK_SHIFT for w in segment}
+        assert len(words) == len(segment)
+        assert words == found.get(m, {})
+    expected_done = (done > 0) | ((seen > 0) & (material > 0))
+    assert np.array_equal(marks.numpy().reshape(height, width) > 0, expected_done)
 
 
 @wp.kernel

@@ -37,7 +37,7 @@ CPU_FLAGS = (
 CPU_LANES = 256
 """Items that one CPU thread owns. Larger than Warp's ``max_unroll``, so that the lane loop stays a loop for LLVM."""
 
-_CHUNKS_PER_WORKER = 4
+_CHUNKS_PER_WORKER = 16
 
 
 def module_options() -> dict:

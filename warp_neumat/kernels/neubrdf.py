@@ -189,9 +189,11 @@ def _scalar_code(layout: Layout) -> str:
 def functions(layout: Layout, lanes: int) -> types.SimpleNamespace:
     """Return the Warp functions that evaluate a material of ``layout`` for a block of ``lanes`` lanes.
 
-    - ``view(grid, wo, scratch)``: takes the local ω_o, [3][L], of all lanes;
+    - ``view(grid, wo, active, count, scratch)``: takes the local ω_o, [3][L];
     - ``light(grid, wi, active, count, scratch, value)``: takes the local ω_i, [3][L], and writes the BRDF [1/sr]
-      without the cosine, [3][L], for the first ``count`` lanes listed in ``active``.
+      without the cosine, [3][L].
+
+    Either works for the first ``count`` lanes listed in ``active``; a light's must be among the view's.
 
     Directions must be unit with z ≥ 0: the caller lists only lanes above the horizon.
     """
@@ -199,8 +201,8 @@ def functions(layout: Layout, lanes: int) -> types.SimpleNamespace:
     FLOAT = wp.constant(wp.uint64(4))
 
     view_rows = f"""
-        for (int l = 0; l < {L}; ++l) {{
-            const float* t[4]; float c[4];
+        for (int a = 0; a < count; ++a) {{
+            const int l = active.data[a]; const float* t[4]; float c[4];
             for (int q = 0; q < 4; ++q) {{
                 t[q] = table.data + {H1} * (long long)index.data[place.data[q * {L} + l]];
                 c[q] = corner.data[q * {L} + l];
@@ -223,6 +225,8 @@ def functions(layout: Layout, lanes: int) -> types.SimpleNamespace:
         table: wp.array(dtype=wp.float32),
         place: wp.array(dtype=wp.int32),
         corner: wp.array(dtype=wp.float32),
+        active: wp.array(dtype=wp.int32),
+        count: int,
         view: wp.array(dtype=wp.float32),
     ): ...
 
@@ -263,7 +267,13 @@ def functions(layout: Layout, lanes: int) -> types.SimpleNamespace:
             corner[3 * L + l] = w[3]
 
     @wp.func
-    def view(grid: Grid, wo: wp.array(dtype=wp.float32), scratch: wp.uint64):
+    def view(
+        grid: Grid,
+        wo: wp.array(dtype=wp.float32),
+        active: wp.array(dtype=wp.int32),
+        count: int,
+        scratch: wp.uint64,
+    ):
         place = wp.array(ptr=scratch, shape=(4 * L,), dtype=wp.int32)
         corner = wp.array(ptr=scratch + wp.uint64(4 * L) * FLOAT, shape=(4 * L,), dtype=wp.float32)
         rotation = wp.array(ptr=scratch + wp.uint64(8 * L) * FLOAT, shape=(2 * L,), dtype=wp.float32)
@@ -279,7 +289,7 @@ def functions(layout: Layout, lanes: int) -> types.SimpleNamespace:
                 rotation[l] = wp.where(off_axis, x * scale, 1.0)
                 rotation[L + l] = wp.where(off_axis, y * scale, 0.0)
         locate(grid.nside, wo.ptr, scratch)
-        view_sums(grid.index_o, grid.table_o, place, corner, sums)
+        view_sums(grid.index_o, grid.table_o, place, corner, active, count, sums)
 
     @wp.func
     def light(
@@ -350,7 +360,7 @@ def make_eval_kernel(layout: Layout, lanes: int):
                 active[lit] = l
                 lit += 1
         if lit > 0:
-            view(grid, O, own)
+            view(grid, O, active, lit, own)
             light(grid, I, active, lit, own, Y)
         for l in range(L):
             if l < rest:

@@ -2,7 +2,8 @@
 
 A *sample image* says which point of the mesh each of its texels stands for: a triangle id (−1 = none) and the weights
 of the triangle's second and third vertex. The atlas is one, the camera raster another, so texture-space and
-screen-space shading are the same kernel. A quad is named by its column and row in one word (:data:`QUAD_SHIFT`).
+screen-space shading are the same kernel. A word names a quad by its column and row and says which of its texels are
+wanted (:data:`ROW_SHIFT`, :data:`MASK_SHIFT`).
 
 A block holds the texels of 64 quads. Position, normal and the local ω_o are computed once per texel; each light adds
 its share for the lanes it reaches, and a light below a lane's horizon costs that lane nothing. Radiance leaves as
@@ -16,25 +17,26 @@ import warp as wp
 from warp_neumat.kernels import dispatch
 from warp_neumat.kernels.frame import frame_tangent, safe_normalize, to_local
 
-QUAD_SHIFT = 16
-"""A quad's word is column | row << QUAD_SHIFT."""
+ROW_SHIFT = 13
+MASK_SHIFT = 26
+"""A quad's word is column | row << ROW_SHIFT | wanted texels << MASK_SHIFT; bit 0 is the upper left texel, bit 1 the
+upper
+right, bits 2 and 3 the lower ones. So an image has at most 2¹³ quads a side."""
 
 HORIZON = wp.constant(0.01)
 """Least cos θ_o that is shaded [1]: interpolated normals may lean away from the viewer on a triangle that faces it."""
 
-WORDS = 29
+WORDS = 28
 """Float32 words of scratch per lane, beside the material's own."""
 
 
 @wp.struct
 class Surface:
-    """A sample image with the mesh and materials it refers to; flat device arrays."""
+    """A sample image with the mesh it refers to; flat device arrays."""
 
     width: int
-    height: int
     triangle: wp.array(dtype=wp.int32)
     barycentric: wp.array(dtype=wp.float32)
-    texel_material: wp.array(dtype=wp.uint8)
     faces: wp.array(dtype=wp.int32)
     side: wp.array(dtype=wp.int8)
     points: wp.array(dtype=wp.float32)
@@ -82,7 +84,6 @@ def make_shade_kernel(functions_of, layout, lanes: int):
         first: int,
         slot: int,
         material: evaluate.Arguments,
-        material_id: int,
         quads: wp.array(dtype=wp.int32),
         quad_count: int,
         surface: Surface,
@@ -115,11 +116,10 @@ def make_shade_kernel(functions_of, layout, lanes: int):
         for l in range(L):
             item = b * L + l
             word = quads[wp.min(item >> 2, quad_count - 1)]
-            x = 2 * (word & 0xFFFF) + (item & 1)
-            y = 2 * (word >> QUAD_SHIFT) + ((item >> 1) & 1)
-            at = wp.min(y, surface.height - 1) * surface.width + wp.min(x, surface.width - 1)
-            inside = (item >> 2) < quad_count and x < surface.width and y < surface.height
-            mine = inside and int(surface.texel_material[at]) == material_id + 1
+            x = 2 * (word & 0x1FFF) + (item & 1)
+            y = 2 * ((word >> ROW_SHIFT) & 0x1FFF) + ((item >> 1) & 1)
+            at = y * surface.width + x
+            mine = (item >> 2) < quad_count and ((word >> (MASK_SHIFT + (item & 3))) & 1) == 1
             address[l] = at
             chosen[l] = wp.where(mine, 1.0, 0.0)
             if mine:
@@ -174,7 +174,12 @@ def make_shade_kernel(functions_of, layout, lanes: int):
             R[l] = 0.0
             Y[l] = 0.0
 
-        view(material, O, own)
+        wanted = int(0)
+        for l in range(L):
+            if chosen[l] > 0.0:
+                active[wanted] = l
+                wanted += 1
+        view(material, O, active, wanted, own)
         total = int(0)
         for j in range(lights.count):
             source = wp.vec3(lights.position[3 * j], lights.position[3 * j + 1], lights.position[3 * j + 2])

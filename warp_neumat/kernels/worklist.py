@@ -2,8 +2,8 @@
 up).
 
 Seen means read: a texel is marked when the bilinear footprint of a visible pixel covers it, so the list holds exactly
-what the gather is about to read. Each quad remembers the epoch it was last shaded in; quads of the current epoch are
-left out, which is both the reuse over frames and the repair of what comes into view in between.
+what the gather is about to read. ``done`` remembers what the epoch has shaded already; it is left out, which is both
+the reuse over frames and the repair of what comes into view in between.
 """
 
 import warp as wp
@@ -148,10 +148,12 @@ def pixel_material_kernel(
 _ROW = """
     const int columns = (width + 1) >> 1;
     const int y = 2 * row;
-    const unsigned char *s0 = seen.data + (long long)y * width, *m0 = texel_material.data + (long long)y * width;
+    const long long at0 = (long long)y * width, at1 = at0 + width;
+    const unsigned char *s0 = seen.data + at0, *m0 = texel_material.data + at0;
+    unsigned char* d0 = done.data + at0;
     const bool two = y + 1 < height;
-    const unsigned char *s1 = two ? s0 + width : s0, *m1 = two ? m0 + width : m0;
-    int* stamps = stamp.data + row * columns;
+    const unsigned char *s1 = two ? seen.data + at1 : s0, *m1 = two ? texel_material.data + at1 : m0;
+    unsigned char* d1 = two ? done.data + at1 : d0;
     int seen_texels = 0, shaded_texels = 0;
     for (int column = 0; column < columns; ++column) {
         const int x = 2 * column;
@@ -162,22 +164,31 @@ _ROW = """
             if (!(a | b)) { column += 3; continue; }
         }
         const bool wide = x + 1 < width;
-        const int marks = s0[x] + (wide ? s0[x + 1] : 0) + (two ? s1[x] + (wide ? s1[x + 1] : 0) : 0);
+        const int s[4] = {s0[x] != 0, wide && s0[x + 1], two && s1[x], two && wide && s1[x + 1]};
+        const int marks = s[0] + s[1] + s[2] + s[3];
         if (!marks) continue;
         seen_texels += marks;
-        if (stamps[column] >= epoch) continue;
-        const int m[4] = {m0[x], wide ? m0[x + 1] : 0, two ? m1[x] : 0, two && wide ? m1[x + 1] : 0};
+        int m[4];  // material + 1 of the texels that are wanted: seen, owned, and not shaded yet
+        m[0] = s[0] && !d0[x] ? m0[x] : 0;
+        m[1] = s[1] && !d0[x + 1] ? m0[x + 1] : 0;
+        m[2] = s[2] && !d1[x] ? m1[x] : 0;
+        m[3] = s[3] && !d1[x + 1] ? m1[x + 1] : 0;
         for (int q = 0; q < 4; ++q) {
             if (!m[q]) continue;
+            int mask = 0;  // of the texels of this material; listed with the first of them
+            for (int p = 0; p < 4; ++p) mask |= (m[p] == m[q]) << p;
             ++shaded_texels;
-            bool fresh = true;  // a quad on a border between materials is listed once for each
-            for (int p = 0; p < q; ++p) fresh = fresh && m[p] != m[q];
-            if (!fresh) continue;
-            int& at = cursor.data[(m[q] - 1) * rows + row];
-            if (fill) quads.data[at] = column | row << 16;
-            ++at;
+            if (mask & ((1 << q) - 1)) continue;
+            int& next = cursor.data[(m[q] - 1) * rows + row];
+            if (fill) quads.data[next] = column | row << 13 | mask << 26;
+            ++next;
         }
-        if (fill) stamps[column] = epoch;
+        if (fill) {
+            if (m[0]) d0[x] = 1;
+            if (m[1]) d0[x + 1] = 1;
+            if (m[2]) d1[x] = 1;
+            if (m[3]) d1[x + 1] = 1;
+        }
     }
     if (!fill) {
         seen_count.data[row] = seen_texels;
@@ -194,9 +205,8 @@ def _list_row(
     width: int,
     height: int,
     rows: int,
-    epoch: int,
     fill: int,
-    stamp: wp.array(dtype=wp.int32),
+    done: wp.array(dtype=wp.uint8),
     cursor: wp.array(dtype=wp.int32),
     seen_count: wp.array(dtype=wp.int32),
     shaded_count: wp.array(dtype=wp.int32),
@@ -212,19 +222,18 @@ def list_kernel(
     width: int,
     height: int,
     rows: int,
-    epoch: int,
     fill: int,
     # outputs
-    stamp: wp.array(dtype=wp.int32),
+    done: wp.array(dtype=wp.uint8),
     cursor: wp.array(dtype=wp.int32),
     seen_count: wp.array(dtype=wp.int32),
     shaded_count: wp.array(dtype=wp.int32),
     quads: wp.array(dtype=wp.int32),
 ):
-    """Count (``fill`` = 0), or write and stamp (1), the quads of a row that have a seen texel and an older stamp.
+    """Count (``fill`` = 0), or write (1), the quads of a row that have texels seen but not done; then they are done.
 
     ``cursor`` is [material][row]: counts in the first pass, positions in ``quads`` in the second. ``seen_count`` and
-    ``shaded_count`` [row] receive texels that are read and texels that the listed quads shade.
+    ``shaded_count`` [row] receive the texels that are read and those that are listed.
     """
     _list_row(
         first + wp.tid(),
@@ -233,9 +242,8 @@ def list_kernel(
         width,
         height,
         rows,
-        epoch,
         fill,
-        stamp,
+        done,
         cursor,
         seen_count,
         shaded_count,

@@ -161,7 +161,7 @@ class OrbitPath(CameraPath):
 CALM = 1.0 / 240.0
 """Turns a frame of the default orbit: ten seconds a turn at 24 frames a second."""
 
-_FILL = 0.9  # of the picture's width or height, by the default orbit
+_FILL = 0.95  # of the picture's width or height, by the default orbit
 
 
 def _fitting_distance(points, centre, elevation: float, fill: float, aspect: float) -> float:
@@ -204,7 +204,7 @@ def orbit(
         elevation: Angle above the horizon [rad], in (−π/2, π/2).
         azimuth: Where the path starts [rad].
         distance: From the centre [scene unit]; by default the nearest from which the outline, seen from any side,
-            leaves a tenth of the picture's width or height free.
+            leaves a twentieth of the picture's width or height free.
         fov_y: Vertical field of view [rad].
         outline: Points that the picture should hold, shape (N, 3); by default the corners of the box.
     """

@@ -2,9 +2,9 @@
 
 A frame passes the stages ``pose`` (animation and upload), ``visibility`` (camera raster), ``mark`` (which texels the
 picture will read), ``list`` (compaction into 2×2 quads by material), ``shade``, and ``gather`` (the picture from the
-radiance texture). With interval N, every (N + 1)th frame starts a new epoch: it freezes pose, viewer and lights, and all
-that is seen from then on is shaded as of that frame, when it is first seen. So the radiance texture is the paper's,
-evaluated lazily: what comes into view within an epoch is neither a hole nor newer than its neighbours.
+radiance texture). With interval N, every (N + 1)th frame starts a new epoch: it freezes pose, viewer and lights, and
+all that is seen from then on is shaded as of that frame, when it is first seen. So the radiance texture is the
+paper's, evaluated lazily: what comes into view within an epoch is neither a hole nor newer than its neighbours.
 
 In screen space, the same shading kernel runs on the camera raster itself, every pixel of every frame: the reference.
 """
@@ -197,7 +197,7 @@ class Renderer:
                 [*pixel, self.shader.radiance, side, side, self.background],
                 [blank, self._image.flatten()],
             )
-        self._epoch, self._since, self._frozen = 0, 0, None
+        self._since = 0
 
     def _shader(self, triangle, barycentric, material) -> TexelShader:
         return TexelShader(self.mesh, self.materials, triangle, barycentric, material, len(self.lights))
@@ -220,9 +220,13 @@ class Renderer:
 
         The first frame, and then every (interval + 1)th, shades anew all that it sees.
         """
-        self._since = 0
+        self.restart()
         for index in range(self.sequence.frame_count) if frames is None else frames:
             yield self.frame(index)
+
+    def restart(self) -> None:
+        """Make the next frame start a new epoch, as the first one does."""
+        self._since = 0
 
     def frame(self, index: int) -> RenderedFrame:
         """Render frame ``index`` as the next picture."""
@@ -232,9 +236,8 @@ class Renderer:
         self._since = 0 if self._since == self.interval else self._since + 1
         self.mesh.show(index)
         if updated:
-            self._epoch += 1
             self.mesh.freeze(camera.eye)
-            self._frozen = (camera.eye, *self.lights.at(index))
+            self.shader.begin(camera.eye, *self.lights.at(index))
         clock.stage("pose")
         self.raster.run(self.mesh.shown, camera.clip())
         clock.stage("visibility")
@@ -244,9 +247,9 @@ class Renderer:
                 self._mark_all.run()
         self._mark.run()
         clock.stage("mark")
-        counts = self.shader.list(self._epoch)
+        counts = self.shader.list()
         clock.stage("list")
-        evaluations = self.shader.shade(*self._frozen)
+        evaluations = self.shader.shade()
         clock.stage("shade")
         self._show.run()
         image = self._image.numpy()

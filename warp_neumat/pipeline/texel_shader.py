@@ -14,7 +14,7 @@ from warp_neumat.pipeline.surface_mesh import SurfaceMesh
 
 @dataclasses.dataclass(frozen=True)
 class ListCounts:
-    """What the last work list holds: texels that will be read, texels to be shaded, quads of each material."""
+    """What a work list holds: texels that will be read, texels to be shaded, quads of each material."""
 
     seen: int
     shaded: int
@@ -24,8 +24,8 @@ class ListCounts:
 class TexelShader:
     """Work list and shading for one sample image of ``width`` × ``height`` texels.
 
-    All buffers are allocated here, once. A frame is :meth:`list` and then :meth:`shade`; ``seen`` is written in between
-    frames by whoever knows what is read.
+    All buffers are allocated here, once. An epoch begins with :meth:`begin`; each of its frames writes :attr:`seen`,
+    and calls :meth:`list` and :meth:`shade`.
 
     Args:
         mesh: The mesh the samples lie on.
@@ -56,19 +56,19 @@ class TexelShader:
         texels = self.width * self.height
         self.seen = zeros(texels, wp.uint8)
         self.radiance = zeros(4 * texels, wp.float16)
-        self.stamp = zeros(columns * self.rows, wp.int32)
+        self._done = zeros(texels, wp.uint8)
         self._cursor = zeros(kinds * self.rows, wp.int32)
         self._seen_count, self._shaded_count = zeros(self.rows, wp.int32), zeros(self.rows, wp.int32)
         # A quad whose four texels have different materials is listed under each.
         self._quads = zeros(columns * self.rows * min(4, kinds), wp.int32)
-        common = [self.seen, texel_material, self.width, self.height, self.rows, 0, 0, self.stamp]
+        common = [self.seen, texel_material, self.width, self.height, self.rows, 0, self._done]
         common += [self._cursor, self._seen_count, self._shaded_count, self._quads]
         self._list_job = dispatch.Job(list_kernel, self.rows, common, device=self.device, grain=16)
 
         surface = Surface()
-        surface.width, surface.height = self.width, self.height
+        surface.width = self.width
         surface.triangle, surface.barycentric = triangle.flatten(), barycentric.flatten()
-        surface.texel_material, surface.faces, surface.side = texel_material, mesh.faces, mesh.side
+        surface.faces, surface.side = mesh.faces, mesh.side
         surface.points, surface.normals = mesh.points.flatten(), mesh.normals.flatten()
         surface.tangents = mesh.tangents.flatten()
         self._keep = (triangle, barycentric, texel_material, surface)
@@ -91,12 +91,12 @@ class TexelShader:
             dispatch.Job(
                 make_shade_kernel(s.functions, s.layout, self._lanes),
                 1,
-                inputs=[s.arguments, m, self._quads, 1, surface, self._lights, wp.vec3(), self._scratch],
+                inputs=[s.arguments, self._quads, 1, surface, self._lights, wp.vec3(), self._scratch],
                 outputs=[self.radiance, self._evaluations],
                 device=self.device,
                 grain=1,
             )
-            for m, s in enumerate(shaders)
+            for s in shaders
         ]
         self._segments: list[tuple[int, int]] = [(0, 0)] * kinds
 
@@ -105,29 +105,8 @@ class TexelShader:
         self.seen = seen
         self._list_job.set(0, seen)
 
-    def list(self, epoch: int) -> ListCounts:
-        """Compact the quads with a seen texel that were not yet shaded in ``epoch``, sorted by material; stamp them."""
-        self._list_job.set(5, int(epoch))
-        self._list_job.set(6, 0)
-        self._cursor.zero_()
-        self._list_job.run()
-        counts = self._cursor.numpy()  # [material][row]; on the CPU a view
-        ends = np.cumsum(counts, dtype=np.int64)
-        starts = ends - counts
-        totals = counts.reshape(len(self.materials), self.rows).sum(axis=1)
-        self._segments = [(int(s), int(n)) for s, n in zip(starts[:: self.rows], totals, strict=True)]
-        if self.device.is_cpu:
-            counts[...] = starts
-        else:
-            self._cursor.assign(starts.astype(np.int32))
-        self._list_job.set(6, 1)
-        self._list_job.run()
-        return ListCounts(
-            int(self._seen_count.numpy().sum()), int(self._shaded_count.numpy().sum()), tuple(int(n) for n in totals)
-        )
-
-    def shade(self, eye, position: np.ndarray, intensity: np.ndarray) -> int:
-        """Shade the listed quads into :attr:`radiance`; return the number of material evaluations.
+    def begin(self, eye, position: np.ndarray, intensity: np.ndarray) -> None:
+        """Begin an epoch: nothing is shaded yet, and viewer and lights are these until the next one.
 
         Args:
             eye: Position of the viewer, shape (3,).
@@ -142,19 +121,45 @@ class TexelShader:
             padded[: 3 * count] = np.asarray(values, np.float32).ravel()
             target.assign(padded)
         self._lights.count = count
+        for job in self._jobs:
+            job.set(4, self._lights)
+            job.set(5, wp.vec3(*(float(c) for c in eye)))
+        self._done.zero_()
+
+    def list(self) -> ListCounts:
+        """Compact the quads with texels that are seen and not shaded in this epoch, sorted by material."""
+        self._list_job.set(5, 0)
+        self._cursor.zero_()
+        self._list_job.run()
+        counts = self._cursor.numpy()  # [material][row]; on the CPU a view
+        ends = np.cumsum(counts, dtype=np.int64)
+        starts = ends - counts
+        totals = counts.reshape(len(self.materials), self.rows).sum(axis=1)
+        self._segments = [(int(s), int(n)) for s, n in zip(starts[:: self.rows], totals, strict=True)]
+        if self.device.is_cpu:
+            counts[...] = starts
+        else:
+            self._cursor.assign(starts.astype(np.int32))
+        self._list_job.set(5, 1)
+        self._list_job.run()
+        return ListCounts(
+            int(self._seen_count.numpy().sum()), int(self._shaded_count.numpy().sum()), tuple(int(n) for n in totals)
+        )
+
+    def shade(self) -> int:
+        """Shade the listed texels into :attr:`radiance`; return the number of material evaluations."""
         if dispatch.worker_count() > self._workers:
             self._workers = dispatch.worker_count()
             self._scratch = wp.zeros(self._workers * self._scratch_words, dtype=wp.float32, device=self.device)
+            for job in self._jobs:
+                job.set(6, self._scratch)
         evaluations = 0
         for job, (start, quads) in zip(self._jobs, self._segments, strict=True):
             if quads == 0:
                 continue
             listed = wp.array(ptr=self._quads.ptr + 4 * start, shape=(quads,), dtype=wp.int32, device=self.device)
-            job.set(2, listed)
-            job.set(3, quads)
-            job.set(5, self._lights)
-            job.set(6, wp.vec3(*(float(c) for c in eye)))
-            job.set(7, self._scratch)
+            job.set(1, listed)
+            job.set(2, quads)
             blocks = dispatch.blocks(4 * quads, self._lanes)
             job.run(blocks)
             evaluations += int(self._evaluations.numpy()[:blocks].sum(dtype=np.int64))
