@@ -152,7 +152,6 @@ def torch_peers(problem: Problem, data_rows: int, evaluations: int, workers: int
     import torch
 
     torch.set_num_threads(workers)
-    torch.set_grad_enabled(False)
     cut, paired = problem.shapes[0].inputs, len(problem.shapes) > 1
     for name, batch in itertools.product(("float32", "bfloat16", "float16"), {min(4096, data_rows), data_rows}):
         dtype = getattr(torch, name)
@@ -179,11 +178,13 @@ def torch_peers(problem: Problem, data_rows: int, evaluations: int, workers: int
         turns = max(1, evaluations // data_rows)
 
         def call(parts=parts, network=network, turns=turns):
-            for _ in range(turns):
-                for part in parts:
-                    network(part)
+            with torch.inference_mode():
+                for _ in range(turns):
+                    for part in parts:
+                        network(part)
 
-        got = network(parts[0][:4096]).float().numpy()
+        with torch.inference_mode():
+            got = network(parts[0][:4096]).float().numpy()
         yield f"torch {name}", call, error_of(got, problem.exact(x.numpy()[: len(got)])), data_rows * turns
 
 
@@ -249,9 +250,14 @@ def _seconds(call) -> float:
 
 def rows(*, device: str, quick: bool):
     """Yield one row per network, place of the data, number of workers and peer."""
+    import torch
+
+    if not wp.get_device(device).is_cpu:
+        raise ValueError(f"this bench compares CPU cores; device must be cpu, got {device}")
     turns = 200_000 if quick else 2_000_000
     rounds = 3 if quick else 15
     everyone = dispatch.worker_count()
+    threads = torch.get_num_threads()
     try:
         for (name, shapes), data, workers in itertools.product(
             NETWORKS.items(), ("cache", "stream"), sorted({1, everyone})
@@ -270,7 +276,7 @@ def rows(*, device: str, quick: bool):
             peak_job = dispatch.Job(
                 peak_kernel,
                 workers,
-                inputs=[wp.array([0.5, 1.0], dtype=wp.float32), sums, turns],
+                inputs=[wp.array([0.5, 1.0], dtype=wp.float32, device="cpu"), sums, turns],
                 device="cpu",
                 grain=1,
             )
@@ -298,3 +304,4 @@ def rows(*, device: str, quick: bool):
                 }
     finally:
         dispatch.set_worker_count(None)
+        torch.set_num_threads(threads)

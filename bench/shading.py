@@ -2,7 +2,7 @@
 
 Fox "Run" under one point light at 2064×2208, an orbiting camera, one measured-like metal. Every frame is rendered by
 all settings in turn, so that noise hits them alike. ``shade_ms`` is the shading stage, ``ms`` the whole frame without
-writing it; both are means per frame after the first, in which kernels are loaded. ``ratio`` is the shading time of
+writing it; both are means per frame over whole epochs, after a frame of warm-up. ``ratio`` is the shading time of
 screen space over ours. FLIP and PSNR compare the tone-mapped pictures with screen space over consecutive frames, so
 that every age of the reused radiance is among them.
 """
@@ -42,11 +42,15 @@ def rows(*, device: str, quick: bool, lights: int = 1, material=None, size=(2064
             settings[side, interval] = Renderer(sequence, materials, atlas=atlas, interval=interval, **common)
     stats: dict = {key: [] for key in settings}
     errors: dict = {key: [] for key in settings}
+    for renderer in settings.values():  # warm up
+        renderer.frame(0)
+        renderer.restart()
     for frame in track(range(frames), "all settings, frame by frame"):
         expected = None
         for key, renderer in settings.items():
             rendered = renderer.frame(frame)
-            if frame:
+            interval = 0 if key == "screen" else key[1]
+            if frame < frames - frames % (interval + 1):  # whole epochs only
                 stats[key].append(rendered.stats)
             if frame not in compared:
                 continue

@@ -23,10 +23,13 @@ Device = Annotated[str, typer.Option(help="Warp device: cpu or cuda:0.")]
 Out = Annotated[Path, typer.Option("-o", "--out", help="Folder to write into; made where it is missing.")]
 
 
+class Usage(ValueError):
+    """An argument that is not written as it must be: exit code 2."""
+
+
 @app.callback()
 def _globals(debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")] = False):
-    if debug:
-        os.environ["NEUMAT_DEBUG"] = "1"
+    pass  # the option is listed here, and taken by main() wherever it stands
 
 
 @contextlib.contextmanager
@@ -74,13 +77,13 @@ def _frames(text: str | None, count: int) -> range:
     try:
         numbers = [int(part) if part else None for part in text.split(":")]
     except ValueError:
-        raise ValueError(f"--frames must be A:B, as 0:48, got {text!r}") from None
+        raise Usage(f"--frames must be A:B, as 0:48, got {text!r}") from None
     if len(numbers) > 2 or (len(numbers) == 1 and numbers[0] is None):
-        raise ValueError(f"--frames must be A:B, as 0:48, got {text!r}")
+        raise Usage(f"--frames must be A:B, as 0:48, got {text!r}")
     first, last = (0, numbers[0]) if len(numbers) == 1 else (numbers[0] or 0, numbers[1])
     last = count if last is None else last
     if not 0 <= first < last:
-        raise ValueError(f"--frames must be A:B with 0 <= A < B, got {text!r}")
+        raise Usage(f"--frames must be A:B with 0 <= A < B, got {text!r}")
     return range(first, last)
 
 
@@ -88,7 +91,7 @@ def _size(text: str) -> tuple[int, int]:
     """Read ``WxH``."""
     width, _, height = text.lower().partition("x")
     if not (width.isdigit() and height.isdigit() and 0 < int(width) <= 16384 and 0 < int(height) <= 16384):
-        raise ValueError(f"--size must be WxH, as 1280x720, up to 16384, got {text!r}")
+        raise Usage(f"--size must be WxH, as 1280x720, up to 16384, got {text!r}")
     return int(width), int(height)
 
 
@@ -98,7 +101,7 @@ def _assignments(pairs: list[str]) -> dict[str, Path]:
     for pair in pairs:
         name, sign, file = pair.partition("=")
         if not (sign and name and file):
-            raise ValueError(f"--material must be NAME=FILE, as fox=bronze.neumat or '*=bronze.neumat', got {pair!r}")
+            raise Usage(f"--material must be NAME=FILE, as fox=bronze.neumat or '*=bronze.neumat', got {pair!r}")
         found[name] = Path(file)
     return found
 
@@ -208,11 +211,9 @@ def _shot(sequence, materials, out, *, frames, interval, atlas, lights, camera, 
     """Set up a renderer, run the shot with progress bars, and say where everything is."""
     from warp_neumat.pipeline.renderer import Renderer
     from warp_neumat.pipeline.shot import prepare_folder, render_shot
-    from warp_neumat.pipeline.tonemap import check_operator
 
     start = time.perf_counter()
     prepare_folder(out)
-    check_operator(more["tonemap"])
     sequence.frame(frames[-1])  # a frame that does not exist shows before the work
     with _progress("atlas") as progress:
         renderer = Renderer(
@@ -293,16 +294,29 @@ def render(
 ):
     """Render a mesh sequence: frames, video, report."""
     from warp_neumat.pipeline.options import parse_background, parse_skips
+    from warp_neumat.pipeline.tonemap import check_operator
 
-    options = {k: str(v) if isinstance(v, Path) else v for k, v in locals().items() if not k.startswith("parse_")}
+    options = {k: str(v) if isinstance(v, Path) else v for k, v in locals().items() if not callable(v)}
     if policy not in ("fixed", "every"):
-        raise ValueError(f"--policy must be fixed or every, got {policy!r}")
+        raise Usage(f"--policy must be fixed or every, got {policy!r}")
     picture, assigned = _size(size), _assignments(material)
-    skip, behind = parse_skips(no_skip or []), parse_background(background)
+    try:
+        skip, behind = parse_skips(no_skip or []), parse_background(background)
+        check_operator(tonemap, exposure)
+    except ValueError as error:
+        raise Usage(error) from None
     _warp(device)
     from warp_neumat.pipeline.sequence import MeshSequence
 
-    loaded = MeshSequence.load(sequence, animation=animation, fps=fps, normals=normals, double_sided=double_sided)
+    with _progress("load") as progress:
+        loaded = MeshSequence.load(
+            sequence,
+            animation=animation,
+            fps=fps,
+            normals=normals,
+            double_sided=double_sided,
+            progress=lambda done, total: progress(done / total, f"{done} of {total} files"),
+        )
     _shot(
         loaded,
         assigned,
@@ -364,10 +378,14 @@ def demo(
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line; a user's mistake ends in one line on stderr and exit code 1, a wrong option in 2."""
     arguments = sys.argv[1:] if arguments is None else arguments
+    debug = "--debug" in arguments  # before or after the command
     try:
-        app(arguments)
-    except (ValueError, TypeError, OSError, ImportError, IndexError, RuntimeError) as error:
-        if os.environ.get("NEUMAT_DEBUG") or "--debug" in arguments:
+        app([a for a in arguments if a != "--debug"] if debug else arguments)
+    except Usage as error:
+        print(f"neumat: {error}", file=sys.stderr)
+        sys.exit(2)
+    except Exception as error:
+        if debug:
             raise
         text = " ".join(str(error).split()) or type(error).__name__
         print(f"neumat: {text}", file=sys.stderr)

@@ -1,5 +1,8 @@
 """The dispatcher: every block once, on as many workers as asked for, errors to the caller."""
 
+import os
+import signal
+
 import numpy as np
 import pytest
 import warp as wp
@@ -54,6 +57,18 @@ def test_an_error_in_a_worker_reaches_the_caller_and_leaves_the_pool_usable(work
     with pytest.raises(RuntimeError, match="from the worker"):
         dispatch._pool.run(work, 1)
     test_every_block_runs_once(workers, 100, 2)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+def test_a_forked_child_has_a_pool_of_its_own(workers):
+    workers(2)
+    dispatch._pool.run(lambda slot: None, 1)  # the parent's helper thread exists now
+    child = os.fork()
+    if child == 0:
+        signal.alarm(20)  # a child that waits for its parent's threads would wait for ever
+        dispatch._pool.run(lambda slot: None, 1)
+        os._exit(0)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
 
 
 def test_worker_count_is_checked(monkeypatch, workers):

@@ -64,6 +64,11 @@ def test_opposite_directions_have_a_half_vector(rng):
     assert np.array_equal(half_vectors(wi, -wi), np.tile(np.float32([0, 0, 1]), (100, 1)))
 
 
+def test_no_directions_give_no_directions():
+    assert half_vectors(np.zeros((0, 3)), np.zeros((0, 3))).shape == (0, 3)
+    assert tangent_frames(np.zeros((0, 3)), np.zeros((0, 4))).shape == (0, 3, 3)
+
+
 def test_frame_functions_name_the_wrong_shape():
     with pytest.raises(ValueError, match=r"wo must have shape \[4, 3\], got \(5, 3\)"):
         half_vectors(np.zeros((4, 3)), np.zeros((5, 3)))

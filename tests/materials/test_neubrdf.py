@@ -88,6 +88,16 @@ def test_eval_is_the_same_on_one_worker_and_keeps_the_callers_kind(asset, rng):
     assert material.eval(None, wi[:0], wo[:0]).shape == (0, 3)
 
 
+def test_brdf_is_value_without_cosine_at_any_length(asset, rng):
+    material = NeuBRDF(*asset)
+    wi, wo = _directions(rng, 500), _directions(rng, 500)
+    value = material.brdf(wi, wo)
+    above = (wi[:, 2] > 0.05) & (wo[:, 2] > 0)
+    assert np.allclose(value[above] * wi[above, 2:], material.eval(None, wi, wo)[above], rtol=1e-5)
+    assert np.allclose(material.brdf(2 * wi, wo)[above], value[above], rtol=1e-3, atol=1e-4)
+    assert (value[~((wi[:, 2] > 0) & (wo[:, 2] > 0))] == 0).all()
+
+
 def test_eval_names_the_wrong_shape(asset):
     with pytest.raises(ValueError, match=r"wo must have shape \[2, 3\], got \(3, 3\)"):
         NeuBRDF(*asset).eval(None, np.zeros((2, 3)), np.zeros((3, 3)))

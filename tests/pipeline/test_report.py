@@ -34,7 +34,7 @@ def fake_report(count=COUNT, interval=4, error=True):
             "gather": rng.uniform(6, 7.5),
             "list": rng.uniform(0.8, 1.2),
             "visibility": rng.uniform(5, 6.5),
-            "atlas": rng.uniform(3, 4),
+            "pose": rng.uniform(3, 4),
         }
         if k == 0:
             ms["shade"] += 900.0
@@ -122,7 +122,7 @@ def test_summary_adds_up():
     finite = [f["error"]["psnr"] for f in source["frames"] if math.isfinite(f["error"]["psnr"])]
     assert summary["psnr"] == pytest.approx(np.mean(finite))
     assert summary["flip_worst"] == pytest.approx(max(f["error"]["flip"] for f in source["frames"]))
-    assert stages(source["frames"])[:4] == ["atlas", "visibility", "list", "shade"]
+    assert stages(source["frames"])[:4] == ["pose", "visibility", "list", "shade"]
     assert stages(source["frames"])[-1] == "reference"
 
 

@@ -105,14 +105,23 @@ class _Pool:
                 threading.Thread(target=self._loop, args=(inbox, slot), name=f"neumat-{slot}", daemon=True).start()
                 self._inboxes.append(inbox)
             done = queue.SimpleQueue()
-            for inbox in self._inboxes[:helpers]:
-                inbox.put((work, done))
-            errors = []
+            errors, running = [], 0
             try:
+                for inbox in self._inboxes[:helpers]:
+                    inbox.put((work, done))
+                    running += 1
                 work(0)
-            except BaseException as error:  # the helpers still hold our arrays: wait for them before leaving
+            except BaseException as error:
                 errors.append(error)
-            errors += [e for e in (done.get() for _ in range(helpers)) if e is not None]
+            while running:  # the helpers hold our arrays and slots: even an interrupt waits for them
+                try:
+                    error = done.get()
+                except KeyboardInterrupt as interrupt:
+                    errors.append(interrupt)
+                    continue
+                running -= 1
+                if error is not None:
+                    errors.append(error)
             if errors:
                 raise errors[0]
 
@@ -138,6 +147,16 @@ class _Pool:
 
 
 _pool = _Pool()
+
+
+def _after_fork() -> None:
+    """Give a forked child a pool of its own: the threads of its parent's do not exist there."""
+    global _pool
+    _pool = _Pool()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_after_fork)
 
 
 class Job:

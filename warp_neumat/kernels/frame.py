@@ -136,6 +136,8 @@ def half_vectors(wi, wo):
     out, lanes = kind.empty(a.shape, wp.float32), dispatch.lanes(kind.device)
     kernel = _make_kernels(lanes)[0]
     count = a.shape[0]
+    if count == 0:  # Warp does not flatten an empty array
+        return kind.give(out)
     dispatch.launch(
         kernel,
         dispatch.blocks(count, lanes),
@@ -164,6 +166,8 @@ def tangent_frames(normals, tangents):
     t = arrays.take(tangents, "tangents", (n.shape[0], 4), wp.float32, kind)
     out, lanes = kind.empty((n.shape[0], 3, 3), wp.float32), dispatch.lanes(kind.device)
     count = n.shape[0]
+    if count == 0:
+        return kind.give(out)
     dispatch.launch(
         _make_kernels(lanes)[1],
         dispatch.blocks(count, lanes),

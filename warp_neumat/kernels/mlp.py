@@ -293,6 +293,8 @@ def mlp_eval(shape: MLPShape, x, packed, *, out=None):
         raise ValueError(
             f"out must be float32 of shape [{count}, {shape.outputs}] on {kind.device}, got {result.shape}"
         )
+    if count == 0:  # Warp does not flatten an empty array
+        return result if out is not None else kind.give(result)
     lanes = dispatch.lanes(kind.device)
     size = dispatch.worker_count() * (shape.inputs + shape.outputs) * lanes if lanes > 1 else 1
     scratch = wp.empty(size, dtype=wp.float32, device=kind.device)

@@ -7,6 +7,8 @@ from collections.abc import Callable, Hashable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from warp_neumat.io.asset import read_asset
 
 KINDS = {"neubrdf": "warp_neumat.materials.neubrdf:NeuBRDF"}
@@ -42,9 +44,13 @@ class Material(abc.ABC):
         """
 
     def brdf(self, wi, wo):
-        """Return the value without the cosine [1/sr] for pairs of directions, shape [n, 3]; 0 below the horizon."""
-        cosine = wi[:, 2:]
-        return self.eval(None, wi, wo) / (cosine + 1e-9 * (cosine <= 0))
+        """Return the value without the cosine [1/sr] for numpy pairs of directions, shape [n, 3]; 0 below the horizon.
+
+        Directions are normalised, as :meth:`eval` does it.
+        """
+        wi = np.asarray(wi, np.float32)
+        cosine = wi[:, 2:] / np.maximum(np.linalg.norm(wi, axis=1, keepdims=True), np.float32(1e-30))
+        return self.eval(None, wi, wo) / np.where(cosine > 0, cosine, 1)
 
     @abc.abstractmethod
     def shader(self) -> "Shader":

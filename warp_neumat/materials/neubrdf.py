@@ -73,6 +73,8 @@ class NeuBRDF(Material):
         if kind.device != self.device:
             raise ValueError(f"wi must be on {self.device}, where the material is, got {kind.device}; move it first")
         result, count = kind.empty(incoming.shape, wp.float32), incoming.shape[0]
+        if count == 0:  # Warp does not flatten an empty array
+            return kind.give(result)
         lanes = dispatch.lanes(self.device)
         words = dispatch.worker_count() * (self.layout.scratch(lanes) + 10 * lanes) if lanes > 1 else 1
         dispatch.launch(

@@ -10,6 +10,7 @@ In screen space, the same shading kernel runs on the camera raster itself, every
 """
 
 import dataclasses
+import operator
 import time
 from collections.abc import Iterable, Iterator
 
@@ -28,6 +29,9 @@ from warp_neumat.pipeline.texel_shader import TexelShader
 SKIPS = ("unowned", "backfacing", "unseen")
 """Texels that are not shaded: of no chart, of triangles that face away, and those the picture does not read."""
 
+SIDE_MAX = 16384
+"""Largest side of a picture or an atlas [px]: a quad's word holds 13 bits for its column and 13 for its row."""
+
 _PIXELS = 4096  # per block of the per-pixel kernels
 
 
@@ -37,10 +41,9 @@ class RenderedFrame:
 
     Attributes:
         index: Frame number in the sequence.
-        image: Linear Rec. 709 radiance, shape (H, W, 3), float32, row 0 on top. The renderer writes the next frame
-            into the same memory: copy what is to be kept.
-        stats: ``ms`` per stage, ``texels`` (owned, facing, seen, shaded), ``evaluations`` (material × light),
-            ``updated`` (whether the frame started a new epoch).
+        image: Linear Rec. 709 radiance, shape (H, W, 3), float32, row 0 on top.
+        stats: ``ms`` per stage, ``texels`` (owned; facing the viewer of the last update, or two-sided; seen; shaded),
+            ``evaluations`` (material × light), ``updated`` (whether the frame started a new epoch).
     """
 
     index: int
@@ -105,12 +108,18 @@ class Renderer:
     ):
         if space not in ("texture", "screen"):
             raise ValueError(f'space must be "texture" or "screen", got {space!r}')
-        if not isinstance(interval, int) or interval < 0:
+        try:
+            self.interval = operator.index(interval)
+        except TypeError:
+            self.interval = -1
+        if self.interval < 0:
             raise ValueError(f"interval must be a whole number of frames, 0 or more, got {interval!r}")
+        if not all(1 <= side <= SIDE_MAX for side in size):
+            raise ValueError(f"size must be 1 to {SIDE_MAX} pixels each way, got {size[0]}x{size[1]}")
         self.skip = frozenset(skip)
         if self.skip - set(SKIPS):
             raise ValueError(f"skip must be among {', '.join(SKIPS)}, got {', '.join(sorted(self.skip - set(SKIPS)))}")
-        self.device, self.space, self.interval = wp.get_device(device), space, interval
+        self.device, self.space = wp.get_device(device), space
         self.sequence = sequence if isinstance(sequence, MeshSequence) else MeshSequence.load(sequence)
         self.assigned = open_materials(materials, device=self.device)
         self.materials, face_material = bind_materials(self.sequence, self.assigned)
@@ -120,6 +129,11 @@ class Renderer:
         if not isinstance(camera, CameraPath):
             picture = {"width": self.width, "height": self.height, "outline": self.sequence.outline()}
             camera = load_camera(camera, lo, hi, frame_count, **picture)
+        first = camera.at(0)
+        if (first.width, first.height) != (self.width, self.height):
+            raise ValueError(
+                f"camera must be made for {self.width}x{self.height} pixels, got {first.width}x{first.height}"
+            )
         self.camera = camera
         self.lights = lights if isinstance(lights, PointLights) else lights_from(lights, lo, hi, frame_count)
         self.background = wp.vec3(*(float(c) for c in background))
@@ -163,6 +177,11 @@ class Renderer:
         else:
             if not isinstance(atlas, Atlas):
                 atlas = Atlas.build(self.sequence, atlas, progress=progress, device=self.device)
+            if len(atlas.corner_uv) != len(self.sequence.faces):
+                raise ValueError(
+                    f"atlas must be built for this sequence of {len(self.sequence.faces)} faces, "
+                    f"got one of {len(atlas.corner_uv)}; use Atlas.build"
+                )
             self.atlas = atlas
             side = atlas.resolution
             owned = atlas.triangle >= 0
@@ -222,22 +241,27 @@ class Renderer:
         """
         self.restart()
         for index in range(self.sequence.frame_count) if frames is None else frames:
-            yield self.frame(index)
+            frame = self.frame(index)
+            yield dataclasses.replace(frame, image=frame.image.copy())
 
     def restart(self) -> None:
         """Make the next frame start a new epoch, as the first one does."""
         self._since = 0
 
     def frame(self, index: int) -> RenderedFrame:
-        """Render frame ``index`` as the next picture."""
+        """Render frame ``index`` as the next picture.
+
+        Its image is read-only and is overwritten by the next frame; :meth:`render` hands out copies.
+        """
         clock = _Clock(self.device)
         camera = self.camera.at(index)
-        updated = self.space == "screen" or self._since == 0
-        self._since = 0 if self._since == self.interval else self._since + 1
+        position, intensity = self.lights.at(index)
         self.mesh.show(index)
+        updated = self.space == "screen" or self._since == 0
         if updated:
             self.mesh.freeze(camera.eye)
-            self.shader.begin(camera.eye, *self.lights.at(index))
+            self.shader.begin(camera.eye, position, intensity)
+        self._since = 0 if self._since == self.interval else self._since + 1
         clock.stage("pose")
         self.raster.run(self.mesh.shown, camera.clip())
         clock.stage("visibility")
@@ -253,6 +277,7 @@ class Renderer:
         clock.stage("shade")
         self._show.run()
         image = self._image.numpy()
+        image.flags.writeable = False  # blocks that stay empty are not written again
         clock.stage("gather")
         texels = {"seen": counts.seen, "shaded": counts.shaded}
         if self.space == "texture":

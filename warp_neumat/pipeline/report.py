@@ -30,7 +30,7 @@ ASIDE = ("reference", "metrics")
 FRAMES_EMBEDDED = 60
 WIDTH_EMBEDDED = 480
 
-_STAGES = ("pose", "atlas", "visibility", "list", "shade", "gather", "tonemap", "write", "video")
+_STAGES = ("pose", "visibility", "mark", "list", "shade", "gather", "tonemap", "write", "video")
 
 
 def write_report(folder, report: dict, *, frames: list = ()) -> dict:

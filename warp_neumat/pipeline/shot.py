@@ -1,5 +1,6 @@
 """A whole shot on disk: frames, video, reference and report."""
 
+import re
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -16,7 +17,7 @@ from warp_neumat.pipeline.tonemap import check_operator, tonemap
 
 
 def prepare_folder(out) -> Path:
-    """Make the folder ``out`` with its ``frames``, and return it.
+    """Make the folder ``out`` with its ``frames``, and return it; what is there stays.
 
     Raises: OSError: If that cannot be done or the folder cannot be written; one line.
     """
@@ -27,6 +28,16 @@ def prepare_folder(out) -> Path:
         raise type(error)(f"{out}: cannot be made ({error.strerror}); choose a folder that you may write to") from None
     check_writable(out / "report.json")
     return out
+
+
+def _clear(out: Path) -> None:
+    """Remove what an earlier shot wrote to ``out``, so that its frames do not pass for this one's."""
+    for part in ("frames", "reference"):
+        for old in (out / part).glob("*"):
+            if re.fullmatch(r"\d{4,}\.(png|exr)", old.name):
+                old.unlink()
+    for name in ("video.mp4", "report.html", "report.json"):
+        (out / name).unlink(missing_ok=True)
 
 
 def render_shot(
@@ -67,12 +78,15 @@ def render_shot(
     """
     if not len(frames):
         raise ValueError("there is no frame to render; give a range A:B with B above A")
+    check_operator(operator, exposure)
+    if reference is not None:  # a missing extra or too small a picture shows before the work
+        blank = np.zeros((renderer.height, renderer.width, 3), np.float32)
+        metrics.ssim(blank, blank)
+        metrics.flip(blank[:16, :16], blank[:16, :16] + 0.5)
     out = prepare_folder(out)
-    check_operator(operator)
+    _clear(out)
     if reference is not None:
         (out / "reference").mkdir(exist_ok=True)
-        blank = np.zeros((16, 16, 3), np.float32)
-        metrics.ssim(blank, blank), metrics.flip(blank, blank + 0.5)  # a missing extra shows before the work
     writer = VideoWriter(out / "video.mp4", renderer.width, renderer.height, renderer.sequence.fps) if video else None
     entries, pictures = [], []
 

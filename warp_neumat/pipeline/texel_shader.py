@@ -162,5 +162,5 @@ class TexelShader:
             job.set(2, quads)
             blocks = dispatch.blocks(4 * quads, self._lanes)
             job.run(blocks)
-            evaluations += int(self._evaluations.numpy()[:blocks].sum(dtype=np.int64))
+            evaluations += int(self._evaluations[:blocks].numpy().sum(dtype=np.int64))
         return evaluations

@@ -53,10 +53,12 @@ def _table(operator: str) -> np.ndarray:
     return table
 
 
-def check_operator(operator: str) -> None:
-    """Raise ValueError, with the names there are, unless ``operator`` is one of them."""
+def check_operator(operator: str, exposure: float = 0.0) -> None:
+    """Raise ValueError unless ``operator`` is one there is and ``exposure`` lies within −60 … 60 stops."""
     if operator not in OPERATORS:
         raise ValueError(f"operator must be one of {', '.join(OPERATORS)}, got {operator!r}")
+    if not abs(exposure) <= 60:
+        raise ValueError(f"exposure must be between -60 and 60 stops, got {exposure}")
 
 
 def tonemap(linear, exposure: float = 0.0, operator: str = "srgb", *, out=None) -> np.ndarray:
@@ -74,9 +76,7 @@ def tonemap(linear, exposure: float = 0.0, operator: str = "srgb", *, out=None) 
     test_tonemap_matches_the_formulas.
     """
     linear = np.ascontiguousarray(linear, dtype=np.float32)
-    check_operator(operator)
-    if not abs(exposure) <= 60:
-        raise ValueError(f"exposure must be between -60 and 60 stops, got {exposure}")
+    check_operator(operator, exposure)
     if out is None:
         out = np.empty_like(linear)
     elif out.shape != linear.shape or out.dtype != np.float32 or not out.flags.c_contiguous:
