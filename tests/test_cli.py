@@ -200,9 +200,11 @@ def test_bad_meshes_are_one_line(run, scene):
 
 
 def test_a_wrong_option_is_exit_code_2(run):
-    assert run("render", "--no-such-option")[0] == 2
-    assert run("paint")[0] == 2
-    assert run("render", "x.glb")[0] == 2  # no material, no folder
+    for arguments in (["render", "--no-such-option"], ["paint"], ["render", "x.glb"], ["info"]):
+        code, _, stderr = run(*arguments)
+        assert code == 2, arguments
+        assert len(stderr.strip().splitlines()) == 1, stderr
+        assert "see neumat --help" in stderr
 
 
 def test_unwritable_folder_is_one_line(run, scene):

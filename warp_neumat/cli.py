@@ -380,16 +380,20 @@ def main(arguments: list[str] | None = None) -> None:
     arguments = sys.argv[1:] if arguments is None else arguments
     debug = "--debug" in arguments  # before or after the command
     try:
-        app([a for a in arguments if a != "--debug"] if debug else arguments)
-    except Usage as error:
-        print(f"neumat: {error}", file=sys.stderr)
-        sys.exit(2)
+        code = app([a for a in arguments if a != "--debug"] if debug else arguments, standalone_mode=False)
+        if code:
+            sys.exit(code)
     except Exception as error:
         if debug:
             raise
+        if hasattr(error, "format_message"):  # the parser's own: unknown command or option, missing argument
+            if not arguments:
+                return  # the help has been printed
+            print(f"neumat: {' '.join(error.format_message().split())}; see neumat --help", file=sys.stderr)
+            sys.exit(error.exit_code)
         text = " ".join(str(error).split()) or type(error).__name__
         print(f"neumat: {text}", file=sys.stderr)
-        sys.exit(1)
+        sys.exit(2 if isinstance(error, Usage) else 1)
     except KeyboardInterrupt:
         print("neumat: interrupted", file=sys.stderr)
         sys.exit(130)

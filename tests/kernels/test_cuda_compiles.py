@@ -1,9 +1,20 @@
-"""Every kernel compiles to PTX, which needs no GPU: one source serves both kinds of device."""
+"""The kernels of the render path compile to PTX, which needs no GPU: one source serves both kinds of device."""
 
 import pytest
 import warp as wp
 
-from warp_neumat.kernels import atlas, frame, gather, healpix, mlp, neubrdf, shade, visibility, worklist
+from warp_neumat.kernels import (
+    atlas,
+    frame,
+    gather,
+    healpix,
+    mlp,
+    neubrdf,
+    shade,
+    visibility,
+    visibility_setup,
+    worklist,
+)
 
 
 def _frame():
@@ -35,6 +46,7 @@ MODULES = {
     "worklist": lambda: worklist.list_kernel.module,
     "gather": lambda: gather.gather_kernel.module,
     "atlas": lambda: wp.get_module(atlas.__name__),
+    "visibility_setup": lambda: visibility_setup.make_project(1).module,
     "visibility": lambda: wp.get_module(visibility.__name__),
 }
 

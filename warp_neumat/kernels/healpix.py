@@ -325,7 +325,8 @@ def vec2pix(nside: int, vec, *, nest: bool, precision: str = "auto", out=None, d
 
     Error: float64 none against healpy, borders included, where both use the same libm (CPU); on CUDA the last bit of
     atan2 may decide a border otherwise. float32 differs only within 1.9 nside 2⁻²⁴ of a border [pixel], by one pixel.
-    Held by test_vec2pix_equals_healpy_* and test_vec2pix_float32_errs_only_at_borders.
+    Held by test_vec2pix_equals_healpy_on_random_directions, test_vec2pix_equals_healpy_on_centres_borders_and_axes and
+    test_vec2pix_float32_errs_only_at_borders.
 
     Source: Górski et al. 2005, Eq. (2)–(9) and Sec. 5.3.
     """

@@ -17,11 +17,13 @@ import warp as wp
 from warp_neumat.kernels import dispatch
 from warp_neumat.kernels.frame import frame_tangent, safe_normalize, to_local
 
-ROW_SHIFT = 13
-MASK_SHIFT = 26
-"""A quad's word is column | row << ROW_SHIFT | wanted texels << MASK_SHIFT; bit 0 is the upper left texel, bit 1 the
-upper
-right, bits 2 and 3 the lower ones. So an image has at most 2¹³ quads a side."""
+ROW_SHIFT, MASK_SHIFT = 13, 26
+"""A quad's word is column | row << ROW_SHIFT | wanted texels << MASK_SHIFT, so an image has at most 2¹³ quads a side.
+
+Bit 0 of the wanted texels is the upper left one, bit 1 the upper right, bits 2 and 3 are the lower ones.
+"""
+
+COLUMN_MASK = (1 << ROW_SHIFT) - 1
 
 HORIZON = wp.constant(0.01)
 """Least cos θ_o that is shaded [1]: interpolated normals may lean away from the viewer on a triangle that faces it."""
@@ -116,8 +118,8 @@ def make_shade_kernel(functions_of, layout, lanes: int):
         for l in range(L):
             item = b * L + l
             word = quads[wp.min(item >> 2, quad_count - 1)]
-            x = 2 * (word & 0x1FFF) + (item & 1)
-            y = 2 * ((word >> ROW_SHIFT) & 0x1FFF) + ((item >> 1) & 1)
+            x = 2 * (word & COLUMN_MASK) + (item & 1)
+            y = 2 * ((word >> ROW_SHIFT) & COLUMN_MASK) + ((item >> 1) & 1)
             at = y * surface.width + x
             mine = (item >> 2) < quad_count and ((word >> (MASK_SHIFT + (item & 3))) & 1) == 1
             address[l] = at

@@ -162,9 +162,9 @@ class CameraRaster:
         tiled: Draw tile by tile (the default on the CPU) or with one thread per triangle (the default on CUDA).
 
     Attributes:
-        triangle: Triangle ids, shape (H, W), int32, −1 where nothing is drawn. Row 0 is the top one. barycentric:
-        Perspective-correct weights of the triangle's second and third vertex, shape (H, W, 2), float32; each
-            ≥ 0 and their sum ≤ 1 but for one rounding; 0 where nothing is drawn.
+        triangle: Triangle ids, shape (H, W), int32, −1 where nothing is drawn. Row 0 is the top one.
+        barycentric: Perspective-correct weights of the triangle's second and third vertex, shape (H, W, 2), float32;
+            each ≥ 0 and their sum ≤ 1 but for one rounding; 0 where nothing is drawn.
         depth: View depth w [scene unit], shape (H, W), float32, +inf where nothing is drawn.
 
     The three arrays are for reading: tiles that stay empty are not written again.

@@ -1,5 +1,4 @@
-"""What has to be shaded: facing triangles, seen texels, and the compacted list of 2×2 quads (DESIGN: skip, then speed
-up).
+"""What has to be shaded: facing triangles, seen texels, and the compacted list of 2×2 quads.
 
 Seen means read: a texel is marked when the bilinear footprint of a visible pixel covers it, so the list holds exactly
 what the gather is about to read. ``done`` remembers what the epoch has shaded already; it is left out, which is both
@@ -9,6 +8,7 @@ the reuse over frames and the repair of what comes into view in between.
 import warp as wp
 
 from warp_neumat.kernels import dispatch
+from warp_neumat.kernels.shade import MASK_SHIFT, ROW_SHIFT
 
 wp.set_module_options(dispatch.module_options())
 
@@ -180,7 +180,7 @@ _ROW = """
             ++shaded_texels;
             if (mask & ((1 << q) - 1)) continue;
             int& next = cursor.data[(m[q] - 1) * rows + row];
-            if (fill) quads.data[next] = column | row << 13 | mask << 26;
+            if (fill) quads.data[next] = column | row << ROW_SHIFT | mask << MASK_SHIFT;
             ++next;
         }
         if (fill) {
@@ -197,7 +197,7 @@ _ROW = """
 """
 
 
-@wp.func_native(_ROW)
+@wp.func_native(f"enum {{ ROW_SHIFT = {ROW_SHIFT}, MASK_SHIFT = {MASK_SHIFT} }};" + _ROW)
 def _list_row(
     row: int,
     seen: wp.array(dtype=wp.uint8),

@@ -37,12 +37,11 @@ def write_report(folder, report: dict, *, frames: list = ()) -> dict:
     """Write ``report.json`` and ``report.html`` into ``folder`` and return the report as it was written.
 
     Args:
-        folder: Existing folder. report: As in the module's docstring. What :func:`summarise` finds is added to its
-        ``summary``; values that are there
-            stay. Floats are written with six digits, NaN and infinities as null.
+        folder: Existing folder.
+        report: As in the module's docstring. What :func:`summarise` finds is added to its ``summary``; values that are
+            there stay. Floats are written with six digits, NaN and infinities as null.
         frames: The pictures of ``report["frames"]``, as many or none: paths of PNG or EXR files, or display values of
-        shape
-            (H, W, 3). At most 60, evenly spaced, are embedded, at most 480 px wide.
+            shape (H, W, 3). At most 60, evenly spaced, are embedded, at most 480 px wide.
 
     Raises:
         OSError: If the folder cannot be written or a picture cannot be read; one line that names the file.

@@ -14,11 +14,10 @@ from warp_neumat.pipeline.surface_mesh import SurfaceMesh
 
 @dataclasses.dataclass(frozen=True)
 class ListCounts:
-    """What a work list holds: texels that will be read, texels to be shaded, quads of each material."""
+    """What a work list holds: texels that will be read, and texels to be shaded."""
 
     seen: int
     shaded: int
-    quads: tuple[int, ...]
 
 
 class TexelShader:
@@ -142,9 +141,7 @@ class TexelShader:
             self._cursor.assign(starts.astype(np.int32))
         self._list_job.set(5, 1)
         self._list_job.run()
-        return ListCounts(
-            int(self._seen_count.numpy().sum()), int(self._shaded_count.numpy().sum()), tuple(int(n) for n in totals)
-        )
+        return ListCounts(int(self._seen_count.numpy().sum()), int(self._shaded_count.numpy().sum()))
 
     def shade(self) -> int:
         """Shade the listed texels into :attr:`radiance`; return the number of material evaluations."""

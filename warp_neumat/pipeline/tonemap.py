@@ -3,9 +3,9 @@
 In this order: exposure (a gain of 2**stops), the operator's curve, clip to [0, 1], the sRGB transfer function
 (IEC 61966-2-1). Operators:
 
-- ``"srgb"`` (default): no curve; what is above 1 clips. - ``"filmic"``: Narkowicz's rational fit of the ACES
-reference transform (K. Narkowicz, "ACES Filmic Tone Mapping Curve",
-  2015), y = x (2.51 x + 0.03) / (x (2.43 x + 0.59) + 0.14), as printed there, for each channel by itself.
+- ``"srgb"`` (default): no curve; what is above 1 clips.
+- ``"filmic"``: Narkowicz's rational fit of the ACES reference transform (K. Narkowicz, "ACES Filmic Tone Mapping
+  Curve", 2015), y = x (2.51 x + 0.03) / (x (2.43 x + 0.59) + 0.14), for each channel by itself.
 """
 
 import functools
