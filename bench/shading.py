@@ -32,7 +32,7 @@ def rows(*, device: str, quick: bool, lights: int = 1, material=None, size=(2064
     sequence = MeshSequence.load(data / "animation" / "Fox.glb", animation="Run")
     resolutions, intervals, compared = RESOLUTIONS, INTERVALS, COMPARED
     if quick:
-        resolutions, intervals, compared, size, frames = (400,), (0, 4), range(1, 3), (258, 276), 4
+        resolutions, intervals, compared, size, frames = (400,), (0, 4), range(1, 3), (258, 276), 5
     common = {"size": size, "lights": lights, "frame_count": max(frames, 48), "device": device}
     materials = {"*": material or material_paths()["knot"]}
     settings: dict = {"screen": Renderer(sequence, materials, space="screen", **common)}

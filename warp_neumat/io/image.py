@@ -53,8 +53,9 @@ def write_png(path, picture) -> None:
     """Write display values, sRGB-encoded, as an 8-bit PNG.
 
     Args:
-        path: File to write or replace; its folder must exist. picture: uint8, or floating point in [0, 1]; shape (H,
-        W), (H, W, 1), (H, W, 3) or (H, W, 4) with straight alpha.
+        path: File to write or replace; its folder must exist.
+        picture: uint8, or floating point in [0, 1]; shape (H, W), (H, W, 1), (H, W, 3) or (H, W, 4) with straight
+            alpha.
 
     Raises:
         OSError: If the file cannot be written; one line that names it.

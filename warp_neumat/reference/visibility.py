@@ -15,12 +15,13 @@ class Visibility:
     """What :func:`rasterize` returns.
 
     Attributes:
-        triangle: Triangle ids, shape (H, W), int32, −1 for background. barycentric: Weights of the second and third
-        vertex, shape (H, W, 2), float64, 0 for background. depth: View depth w, shape (H, W), float64, +inf for
-        background. slope: Change of a weight over a pixel, the largest of the three [1/px], shape (H, W), float64, 0
-        for background. decided: Whether the triangle id is safe from rounding, shape (H, W): no edge of a triangle
-        that could show passes
-            within ``edge`` pixels of the centre, no near or far plane within a relative ``tie``, and no other
+        triangle: Triangle ids, shape (H, W), int32, −1 for background.
+        barycentric: Weights of the second and third vertex, shape (H, W, 2), float64, 0 for background.
+        depth: View depth w, shape (H, W), float64, +inf for background.
+        slope: Change of a weight over a pixel, the largest of the three [1/px], shape (H, W), float64, 0 for
+            background.
+        decided: Whether the triangle id is safe from rounding, shape (H, W): no edge of a triangle that could show
+            passes within ``edge`` pixels of the centre, no near or far plane within a relative ``tie``, and no other
             triangle lies within a relative ``tie`` of the depth shown.
     """
 
