@@ -5,6 +5,7 @@ is x right, y up, z/w in [0, 1] from near to far, and w is the view depth [scene
 pixels, x to the right and y down from the top left corner; pixel i is centred at i + 0.5.
 """
 
+import abc
 import dataclasses
 import math
 
@@ -106,12 +107,12 @@ class Camera:
         return self.eye, direction @ self.view[:3, :3]
 
 
-class CameraPath:
+class CameraPath(abc.ABC):
     """A camera for every frame; :class:`OrbitPath` and :class:`KeyPath` are the two kinds."""
 
+    @abc.abstractmethod
     def at(self, frame: float) -> Camera:
         """Return the camera of ``frame``; fractions are allowed."""
-        raise NotImplementedError
 
 
 def bounding_sphere(lo, hi) -> tuple[np.ndarray, float]:
