@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from warp_neumat.io.asset import pack_bits
+from warp_neumat.io.asset import pack_bits, write_asset
+from warp_neumat.kernels.bc6h_tables import MODES
 
 
 def random_neubrdf(rng, *, nside=8, features=8, bits=6, hidden=(64, 64), frame="isotropic"):
@@ -19,3 +20,97 @@ def random_neubrdf(rng, *, nside=8, features=8, bits=6, hidden=(64, 64), frame="
     config = {"nside": nside, "features": features, "bits": bits, "hidden": list(hidden), "frame": frame}
     config |= {"interpolation": "bilinear", "output": "expm1"}
     return tensors, {"kind": "neubrdf", "version": 1, "config": config}
+
+
+CHANNELS = [
+    *({"map": "base_color", "component": c, "encoding": "srgb", "range": [0.0, 1.0]} for c in "rgb"),
+    *({"map": "normal", "component": c, "encoding": "normal", "range": [0.0, 1.0]} for c in "xy"),
+    {"map": "roughness", "component": "value", "encoding": "linear", "range": [0.0, 1.0]},
+    {"map": "metallic", "component": "value", "encoding": "linear", "range": [0.0, 1.0]},
+    {"map": "occlusion", "component": "value", "encoding": "linear", "range": [0.0, 1.0]},
+    {"map": "displacement", "component": "value", "encoding": "linear", "range": [0.25, 0.75]},
+    *({"map": "emissive", "component": c, "encoding": "srgb", "range": [0.0, 1.0]} for c in "rgb"),
+    {"map": "opacity", "component": "value", "encoding": "linear", "range": [0.0, 1.0]},
+    *({"map": f"mask_{k}", "component": "value", "encoding": "linear", "range": [0.0, 1.0]} for k in "abc"),
+]
+"""The outputs of :func:`random_bcf`, as many as it is asked for from the front."""
+
+
+def random_blocks(rng, count: int, *, signed=False, modes=range(1, 15)) -> np.ndarray:
+    """Return (count, 16) uint8 BC6H blocks of the listed modes: endpoints of size about 1/8 to 2, all else random.
+
+    Stored differences are random bits, so where they are long, single endpoints go beyond.
+    """
+    bits = rng.integers(0, 2, (count, 128), dtype=np.uint8)
+    chosen = rng.choice(list(modes), count)
+    for mode in MODES:
+        rows = np.flatnonzero(chosen == mode.number)
+        bits[rows, : mode.mode_bits] = (mode.bits >> np.arange(mode.mode_bits)) & 1
+        top = 1 << (mode.precision - 1 if signed else mode.precision)
+        # The half float 1.0 lies at 15/31 of the endpoints' range, and a factor of 2 is 1/31 of it.
+        ends = (rng.uniform(0.39, 0.52, (len(rows), 4, 3)) * top).astype(np.int64)
+        if signed:
+            ends *= rng.choice([-1, 1], ends.shape)
+        for position, (channel, endpoint, bit) in enumerate(mode.fields, mode.mode_bits):
+            if endpoint == 0 or not mode.transformed:
+                bits[rows, position] = (ends[:, endpoint, channel] >> bit) & 1
+    return np.packbits(bits, axis=1, bitorder="little")
+
+
+def random_bcf(
+    rng,
+    *,
+    size=64,
+    features=(32, 16, 8, 4),
+    mips=None,
+    channels=9,
+    hidden=16,
+    signed=False,
+    wrap="repeat",
+    modes=range(1, 15),
+    constants=None,
+):
+    """Return (tensors, header) of a BCf whose textures are random blocks and whose outputs vary around 1/2.
+
+    Args:
+        rng: Generator.
+        size: Side of the reference material, or (width, height).
+        features: Sides of the textures, or (width, height) each.
+        mips: Mips of each texture; all of them by default.
+        channels: Network outputs, the first so many of :data:`CHANNELS`.
+        hidden: Hidden width.
+        signed: Whether the blocks are BC6H_SF16.
+        wrap: Wrap mode.
+        modes: BC6H modes that occur.
+        constants: Maps that are stored as scalars.
+    """
+
+    def pair(n):
+        return (n, n) if isinstance(n, int) else tuple(n)
+
+    tensors, textures = {}, []
+    for t, (w, h) in enumerate(map(pair, features)):
+        count = mips[t] if mips else max(w, h).bit_length()
+        textures.append({"width": w, "height": h, "mips": count})
+        for m in range(count):
+            rows, columns = -(-max(1, h >> m) // 4), -(-max(1, w >> m) // 4)
+            blocks = random_blocks(rng, rows * columns, signed=signed, modes=modes)
+            tensors[f"texture{t}.mip{m}"] = blocks.reshape(rows, columns, 16)
+    inputs = 3 * len(textures)
+    tensors["weight0"] = (rng.normal(size=(hidden, inputs)) * np.sqrt(1 / inputs)).astype(np.float16)
+    tensors["bias0"] = np.full(hidden, 0.2, np.float16)
+    tensors["weight1"] = (rng.normal(size=(channels, hidden)) * 0.15).astype(np.float16)
+    tensors["bias1"] = np.full(channels, 0.5, np.float16)
+    width, height = pair(size)
+    config = {
+        "textures": textures, "signed": signed, "hidden": hidden, "width": width, "height": height, "wrap": wrap,
+        "channels": CHANNELS[:channels], "constants": {"specular": [0.5]} if constants is None else constants,
+    }  # fmt: skip
+    return tensors, {"kind": "bcf", "version": 1, "config": config}
+
+
+def fake_bcf(path, *, seed=0, **shape) -> dict:
+    """Write a :func:`random_bcf` to ``path`` and return its header."""
+    tensors, header = random_bcf(np.random.default_rng(seed), **shape)
+    write_asset(path, tensors, header)
+    return header

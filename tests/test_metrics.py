@@ -156,3 +156,63 @@ def test_a_missing_library_names_the_extra(monkeypatch, metric, module, package)
     monkeypatch.setitem(sys.modules, module, None)  # importing it now fails
     with pytest.raises(ImportError, match=rf"{package} is not installed; pip install 'warp-neumat\[report\]'"):
         metric(flat(0), flat(1))
+
+
+def test_channel_mse_by_hand_and_psnr_of_its_mean():
+    reference = np.zeros((70, 3, 2), np.float32)  # more rows than are taken at a time
+    test = reference.copy()
+    test[..., 1] = 0.1
+    test[69, 2, 0] = 0.5
+    mse = metrics.channel_mse(reference, test)
+    assert mse.dtype == np.float64
+    np.testing.assert_allclose(mse, [0.25 / 210, 0.01], rtol=1e-6)
+    assert metrics.psnr_of_mse(mse) == pytest.approx(-10 * math.log10((0.25 / 210 + 0.01) / 2))
+    assert metrics.psnr_of_mse([0.0, 0.0]) is None
+
+
+def test_map_metrics_are_the_picture_metrics_of_what_is_seen(picture, rng):
+    test = np.clip(picture + rng.normal(0, 0.1, picture.shape), 0, 1).astype(np.float32)
+    assert metrics.map_ssim(picture, test) == pytest.approx(metrics.ssim(picture, test))
+    assert metrics.map_flip(picture, test) == metrics.flip(picture, test)[0]
+    grey = [np.repeat(values[..., :1], 3, axis=2) for values in (picture, test)]
+    assert metrics.map_ssim(picture[..., :1], test[..., :1]) == pytest.approx(metrics.ssim(*grey), abs=1e-6)
+    assert metrics.map_flip(picture[..., :1], test[..., :1]) == pytest.approx(metrics.flip(*grey)[0])
+
+
+def test_small_maps_have_no_ssim_and_a_flip():
+    small = np.full((10, 64, 1), 0.5, np.float32)
+    assert metrics.map_ssim(small, small) is None
+    assert metrics.map_ssim(np.full((11, 11, 1), 0.5, np.float32), np.full((11, 11, 1), 0.5, np.float32)) == 1
+    one = np.full((1, 1, 1), 0.5, np.float32)
+    assert metrics.map_flip(one, one) == 0
+    assert 0 < metrics.map_flip(one, one + 0.1) < 1
+
+
+def test_colour_picture_of_any_number_of_channels():
+    values = np.float32([[[0.1, 0.2, 0.3, 0.4]]])
+    for count, expected in ((1, [0.1, 0.1, 0.1]), (2, [0.1, 0.2, 0]), (3, [0.1, 0.2, 0.3]), (4, [0.1, 0.2, 0.3])):
+        np.testing.assert_array_equal(metrics.colour_picture(values[..., :count])[0, 0], np.float32(expected))
+    np.testing.assert_array_equal(metrics.colour_picture(np.float32([[[-1, 0.5, 2]]]))[0, 0], [0, 0.5, 1])
+
+
+def test_angular_error_keeps_small_angles():
+    angles = np.radians([0.0, 0.001, 90.0, 180.0])
+    up = np.broadcast_to(np.float32([0, 0, 1]), (4, 3))
+    tilted = np.stack([np.sin(angles), np.zeros(4), np.cos(angles)], axis=1).astype(np.float32)
+    mean, high = metrics.angular_error(up[:2], tilted[:2])
+    assert mean == pytest.approx(0.0005, rel=1e-4)
+    assert high == pytest.approx(0.00095, rel=1e-4)
+    assert metrics.angular_error(up, tilted)[0] == pytest.approx((0.001 + 90 + 180) / 4)
+    with pytest.raises(ValueError, match=r"the same shape \(..., 3\), got \(4, 3\) and \(2, 3\)"):
+        metrics.angular_error(up, tilted[:2])
+
+
+@pytest.mark.parametrize("metric", [metrics.channel_mse, metrics.map_ssim])
+def test_bad_maps_are_named(metric):
+    good = np.zeros((12, 12, 2), np.float32)
+    with pytest.raises(ValueError, match=r"test must have the reference's shape \(12, 12, 2\), got \(12, 12, 1\)"):
+        metric(good, good[..., :1])
+    with pytest.raises(ValueError, match="test must be finite, and holds NaN or infinite values"):
+        metric(good, np.full_like(good, math.nan))
+    with pytest.raises(TypeError, match="reference must be floating point"):
+        metric(good.astype(np.uint8), good)

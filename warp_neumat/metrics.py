@@ -1,8 +1,10 @@
-"""How far a picture is from its reference: MAE, RMSE, PSNR, SSIM, FLIP.
+"""How far a picture is from its reference: MAE, RMSE, PSNR, SSIM, FLIP; of texture maps, also angles of normals.
 
-All of them compare display-referred pictures: sRGB-encoded, shape (H, W, 3), float32, values in [0, 1] (tonemap
-first). SSIM and FLIP come from the libraries whose figures others report, scikit-image and flip-evaluator, which are
-imported when they are first needed.
+The first group compares display-referred pictures: sRGB-encoded, shape (H, W, 3), float32, values in [0, 1] (tonemap
+first). The second, from :func:`channel_mse` on, compares texture maps of any number of channels, as encoded, and any
+size down to one texel; what cannot be measured there is ``None``, never NaN or infinite, so that it can go into JSON.
+SSIM and FLIP come from the libraries whose figures others report, scikit-image and flip-evaluator, which are imported
+when they are first needed.
 """
 
 import importlib
@@ -63,6 +65,10 @@ def ssim(reference, test) -> float:
     reference, test = _pair(reference, test)
     if min(reference.shape[:2]) < 11:
         raise ValueError(f"SSIM needs pictures of at least 11x11 pixels, got {reference.shape[1]}x{reference.shape[0]}")
+    return _structural_similarity(reference, test)
+
+
+def _structural_similarity(reference: np.ndarray, test: np.ndarray) -> float:
     structural_similarity = _library("skimage.metrics", "scikit-image").structural_similarity
     window = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
     return float(structural_similarity(reference, test, channel_axis=2, data_range=1.0, **window))
@@ -116,3 +122,73 @@ def _differing(reference, test, margin: int) -> tuple[slice, slice] | None:
             return None
         window.append(slice(max(0, int(hit[0]) - margin), int(hit[-1]) + 1 + margin))
     return window[0], window[1]
+
+
+def channel_mse(reference, test) -> np.ndarray:
+    """Return the mean squared difference of each channel, shape (C,), float64, of maps (H, W, C) in [0, 1]."""
+    reference, test = _maps(reference, test)
+    total = np.zeros(reference.shape[2])
+    for row in range(0, len(reference), 64):  # temporaries stay small
+        difference = test[row : row + 64] - reference[row : row + 64]
+        total += np.square(difference, dtype=np.float64).sum(axis=(0, 1))
+    return total / (reference.shape[0] * reference.shape[1])
+
+
+def psnr_of_mse(mse) -> float | None:
+    """Return −10 log10 of the mean of mean squared errors [dB] for a peak of 1; ``None`` where the error is 0.
+
+    Averaging errors first is how papers on texture compression aggregate over channels and mips.
+    """
+    mean = float(np.mean(mse))
+    return None if mean == 0.0 else -10.0 * math.log10(mean)
+
+
+def map_ssim(reference, test) -> float | None:
+    """Return :func:`ssim` of maps (H, W, C), the mean over channels; ``None`` if a side is shorter than 11 px."""
+    reference, test = _maps(reference, test)
+    return None if min(reference.shape[:2]) < 11 else _structural_similarity(reference, test)
+
+
+def map_flip(reference, test) -> float:
+    """Return the mean LDR-FLIP of maps (H, W, C) seen as :func:`colour_picture` shows them."""
+    return flip(colour_picture(reference), colour_picture(test))[0]
+
+
+def colour_picture(values) -> np.ndarray:
+    """Return a map (H, W, C) as a picture (H, W, 3), float32, clipped to [0, 1].
+
+    One channel becomes grey, two become red and green, three are shown as they are; of more, the first three.
+    """
+    values = np.asarray(values)
+    if values.ndim != 3 or values.size == 0:
+        raise ValueError(f"values must have shape (H, W, C), got {values.shape}")
+    picture = np.zeros((*values.shape[:2], 3), np.float32)
+    picture[..., : values.shape[2]] = values[..., :3]
+    if values.shape[2] == 1:
+        picture[..., 1:] = values
+    return np.clip(picture, 0.0, 1.0, out=picture)
+
+
+def angular_error(reference, test) -> tuple[float, float]:
+    """Return mean and 95th percentile of the angle [degree] between unit vectors, shape (..., 3)."""
+    reference, test = np.asarray(reference, np.float32), np.asarray(test, np.float32)
+    if reference.shape != test.shape or reference.shape[-1:] != (3,) or reference.size == 0:
+        raise ValueError(f"both must have the same shape (..., 3), got {reference.shape} and {test.shape}")
+    # The arctangent keeps its precision at small angles, where an arccosine of float32 has a floor of 0.03 degrees.
+    sine = np.linalg.norm(np.cross(reference, test), axis=-1)
+    angle = np.degrees(np.arctan2(sine, (reference * test).sum(axis=-1)))
+    return float(angle.mean(dtype=np.float64)), float(np.percentile(angle, 95.0))
+
+
+def _maps(reference, test) -> tuple[np.ndarray, np.ndarray]:
+    reference, test = np.asarray(reference), np.asarray(test)
+    if reference.ndim != 3 or reference.size == 0:
+        raise ValueError(f"reference must have shape (H, W, C), got {reference.shape}")
+    if reference.shape != test.shape:
+        raise ValueError(f"test must have the reference's shape {reference.shape}, got {test.shape}")
+    for name, values in (("reference", reference), ("test", test)):
+        if values.dtype.kind != "f":
+            raise TypeError(f"{name} must be floating point with values in [0, 1], got {values.dtype}; divide by 255")
+        if not np.isfinite(values).all():
+            raise ValueError(f"{name} must be finite, and holds NaN or infinite values")
+    return reference.astype(np.float32, copy=False), test.astype(np.float32, copy=False)

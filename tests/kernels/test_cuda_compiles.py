@@ -5,9 +5,13 @@ import warp as wp
 
 from warp_neumat.kernels import (
     atlas,
+    bcf,
+    bcf_shade,
     frame,
     gather,
+    ggx,
     healpix,
+    lod,
     mlp,
     neubrdf,
     shade,
@@ -37,12 +41,20 @@ def _shade():
     return shade.make_shade_kernel(neubrdf.functions, neubrdf.Layout((64, 64), True), 1).module
 
 
+def _shade_textured():
+    layout = bcf_shade.Layout(bcf.Layout(channels=12))
+    return shade.make_shade_kernel(bcf_shade.functions, layout, 1, textured=True).module
+
+
 MODULES = {
     "frame": _frame,
     "healpix": _healpix,
     "mlp": _mlp,
     "neubrdf": _neubrdf,
     "shade": _shade,
+    "shade_textured": _shade_textured,
+    "ggx": lambda: ggx._make_kernel(1).module,
+    "lod": lambda: lod.uv_gradient_kernel.module,
     "worklist": lambda: worklist.list_kernel.module,
     "gather": lambda: gather.gather_kernel.module,
     "atlas": lambda: wp.get_module(atlas.__name__),

@@ -3,6 +3,7 @@
 A file appears whole or not at all. OpenImageIO does the coding and is imported when first needed.
 """
 
+import contextlib
 import dataclasses
 from pathlib import Path
 
@@ -84,16 +85,45 @@ def write_exr(path, picture, half: bool = True) -> None:
     _write(path, picture, "half" if half else "float", "exr", extra)
 
 
-def read_image(path) -> tuple[np.ndarray, ImageInfo]:
+def read_image(path, *, stored: bool = False) -> tuple[np.ndarray, ImageInfo]:
     """Return a picture file's values, shape (H, W, C), float32, and what the file says of itself.
 
     Values are as stored: integers scaled to [0, 1], floats unchanged, no transfer function undone, alpha straight in
-    PNG and premultiplied in EXR.
+    PNG and premultiplied in EXR. With ``stored``, 8- and 16-bit integers stay uint8 and uint16, unscaled.
 
     Raises:
         FileNotFoundError: If there is no such file.
-        OSError: If it cannot be decoded; one line that names it.
+        OSError: If it cannot be decoded or ends early; one line that names it.
     """
+    with _opened(path) as source:
+        spec = source.spec()
+        kind = str(spec.format) if stored and str(spec.format) in ("uint8", "uint16") else "float"
+        pixels = source.read_image(kind)
+        if pixels is None or source.has_error:
+            raise OSError(f"{path}: is damaged: {_line(source.geterror())}")
+    dtype = np.float32 if kind == "float" else kind
+    pixels = np.ascontiguousarray(pixels, dtype=dtype).reshape(spec.height, spec.width, spec.nchannels)
+    return pixels, _info(spec)
+
+
+def read_image_info(path) -> ImageInfo:
+    """Return what a picture file says of itself; only its header is read.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        OSError: If it is no picture; one line that names it.
+    """
+    with _opened(path) as source:
+        return _info(source.spec())
+
+
+def _info(spec) -> ImageInfo:
+    space = spec.getattribute("oiio:ColorSpace") or ""
+    return ImageInfo(spec.width, spec.height, tuple(spec.channelnames), str(spec.format), space)
+
+
+@contextlib.contextmanager
+def _opened(path):
     import OpenImageIO as oiio
 
     path = Path(path)
@@ -105,15 +135,9 @@ def read_image(path) -> tuple[np.ndarray, ImageInfo]:
     if source is None:
         raise OSError(f"{path}: cannot be read as a picture: {_line(oiio.geterror())}")
     try:
-        spec = source.spec()
-        pixels = source.read_image("float")
-        if pixels is None or source.has_error:
-            raise OSError(f"{path}: is damaged: {_line(source.geterror())}")
+        yield source
     finally:
         source.close()
-    pixels = np.ascontiguousarray(pixels, dtype=np.float32).reshape(spec.height, spec.width, spec.nchannels)
-    space = spec.getattribute("oiio:ColorSpace") or ""
-    return pixels, ImageInfo(spec.width, spec.height, tuple(spec.channelnames), str(spec.format), space)
 
 
 def _shaped(picture) -> np.ndarray:

@@ -98,7 +98,7 @@ def _split(outputs: int, most: int) -> list[tuple[int, int, int]]:
     return runs
 
 
-def _layer_code(inputs, outputs, *, source, stride, target, target_stride, offset, relu, most, vectors) -> str:
+def layer_code(inputs, outputs, *, source, stride, target, target_stride, offset, relu, most, vectors) -> str:
     """C++ for one layer over one tile of ``vectors`` vectors of lanes."""
     text = []
     bias, weight = offset, offset + outputs
@@ -149,7 +149,7 @@ def _cpu_code(shape: MLPShape, lanes: int, *, vector: int, vectors: int, most: i
         last = layer == len(shape.layers) - 1
         target, target_stride = ("(y.data + t)", lanes) if last else (f"h{layer % 2}", tile)
         text.append(
-            _layer_code(
+            layer_code(
                 inputs, outputs, source=source, stride=stride, target=target, target_stride=target_stride,
                 offset=offset, relu=not last, most=most, vectors=vectors,
             )

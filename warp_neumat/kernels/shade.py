@@ -8,6 +8,9 @@ wanted (:data:`ROW_SHIFT`, :data:`MASK_SHIFT`).
 A block holds the texels of 64 quads. Position, normal and the local ω_o are computed once per texel; each light adds
 its share for the lanes it reaches, and a light below a lane's horizon costs that lane nothing. Radiance leaves as
 float16, RGB and coverage, because the gather is bound by the bytes it reads.
+
+A *textured* material also gets each lane's uv and the mip level its footprint asks for (``kernels/lod.py``); the
+others' kernels hold nothing of that.
 """
 
 import functools
@@ -16,6 +19,7 @@ import warp as wp
 
 from warp_neumat.kernels import dispatch
 from warp_neumat.kernels.frame import frame_tangent, safe_normalize, to_local
+from warp_neumat.kernels.lod import lod_of, pixel_rho2
 
 ROW_SHIFT, MASK_SHIFT = 13, 26
 """A quad's word is column | row << ROW_SHIFT | wanted texels << MASK_SHIFT, so an image has at most 2¹³ quads a side.
@@ -28,13 +32,19 @@ COLUMN_MASK = (1 << ROW_SHIFT) - 1
 HORIZON = wp.constant(0.01)
 """Least cos θ_o that is shaded [1]: interpolated normals may lean away from the viewer on a triangle that faces it."""
 
-WORDS = 28
-"""Float32 words of scratch per lane, beside the material's own."""
+
+def words(layout, lanes: int, textured: bool) -> int:
+    """Return the float32 words of scratch that the shading kernel of a material needs for one block."""
+    return layout.scratch(lanes) + (37 if textured else 28) * lanes
 
 
 @wp.struct
 class Surface:
-    """A sample image with the mesh it refers to; flat device arrays."""
+    """A sample image with the mesh it refers to; flat device arrays.
+
+    The last three are read for textured materials only: texture coordinates per vertex, the gradients of
+    ``kernels.lod.uv_gradient_kernel`` and the least mip level per triangle.
+    """
 
     width: int
     triangle: wp.array(dtype=wp.int32)
@@ -44,6 +54,19 @@ class Surface:
     points: wp.array(dtype=wp.float32)
     normals: wp.array(dtype=wp.float32)
     tangents: wp.array(dtype=wp.float32)
+    uv: wp.array(dtype=wp.float32)
+    uv_gradient: wp.array(dtype=wp.float32)
+    least_lod: wp.array(dtype=wp.float32)
+
+
+@wp.struct
+class Viewer:
+    """Where the picture is seen from: eye, unit view direction, and how a ray of view depth 1 moves over one pixel."""
+
+    eye: wp.vec3
+    forward: wp.vec3
+    right: wp.vec3
+    down: wp.vec3
 
 
 @wp.struct
@@ -66,19 +89,20 @@ def local_view(v: wp.vec3, t: wp.vec3, b: wp.vec3, n: wp.vec3) -> wp.vec3:
 
 
 @functools.cache
-def make_shade_kernel(functions_of, layout, lanes: int):
+def make_shade_kernel(functions_of, layout, lanes: int, textured: bool = False):
     """Return the shading kernel of one kind of material.
 
     Args:
         functions_of: ``functions(layout, lanes)`` of the material's kernel file.
         layout: The material's compile-time layout.
         lanes: Lanes of a block, a multiple of 4 on the CPU; 1 on CUDA, where a block is one texel.
+        textured: Which of the two sets of functions it is; see ``materials.base.Shader``.
     """
     evaluate = functions_of(layout, lanes)
     view, light = evaluate.view, evaluate.light
-    L, OWN = lanes, layout.scratch(lanes)
+    L = lanes
     # Two names, because a constant that is cast keeps the new type in the rest of the kernel.
-    TOTAL = STRIDE = OWN + WORDS * L
+    TOTAL = STRIDE = words(layout, lanes, textured)
     FLOAT = wp.constant(wp.uint64(4))
 
     @wp.kernel(module="unique", module_options=dispatch.module_options())
@@ -90,7 +114,7 @@ def make_shade_kernel(functions_of, layout, lanes: int):
         quad_count: int,
         surface: Surface,
         lights: Lights,
-        eye: wp.vec3,
+        viewer: Viewer,
         scratch: wp.array(dtype=wp.float32),
         # outputs
         radiance: wp.array(dtype=wp.float16),
@@ -112,7 +136,11 @@ def make_shade_kernel(functions_of, layout, lanes: int):
         address = wp.array(ptr=own + wp.uint64(25 * L) * FLOAT, shape=(L,), dtype=wp.int32)
         active = wp.array(ptr=own + wp.uint64(26 * L) * FLOAT, shape=(L,), dtype=wp.int32)
         chosen = wp.array(ptr=own + wp.uint64(27 * L) * FLOAT, shape=(L,), dtype=wp.float32)
-        own = own + wp.uint64(WORDS * L) * FLOAT
+        own = own + wp.uint64(28 * L) * FLOAT
+        if wp.static(textured):
+            Q = wp.array(ptr=own, shape=(3 * L,), dtype=wp.float32)  # u, v and mip level
+            G = wp.array(ptr=own + wp.uint64(3 * L) * FLOAT, shape=(6 * L,), dtype=wp.float32)
+            own = own + wp.uint64(9 * L) * FLOAT
 
         # Which texels, and what they see of the mesh: gathers, so no vector code, and none is wanted.
         for l in range(L):
@@ -150,18 +178,31 @@ def make_shade_kernel(functions_of, layout, lanes: int):
                         + b2 * surface.tangents[4 * i2 + c]
                     )
                 T[3 * L + l] = sign * surface.tangents[4 * i0 + 3]
+                if wp.static(textured):
+                    for c in range(2):
+                        Q[c * L + l] = (
+                            b0 * surface.uv[2 * i0 + c] + b1 * surface.uv[2 * i1 + c] + b2 * surface.uv[2 * i2 + c]
+                        )
+                    Q[2 * L + l] = surface.least_lod[f]
+                    for c in range(6):
+                        G[c * L + l] = surface.uv_gradient[6 * f + c]
             else:
                 for c in range(3):
                     P[c * L + l] = 0.0
                     N[c * L + l] = wp.where(c == 2, 1.0, 0.0)
                     T[c * L + l] = wp.where(c == 0, 1.0, 0.0)
                 T[3 * L + l] = 1.0
+                if wp.static(textured):
+                    for c in range(3):
+                        Q[c * L + l] = 0.0
+                    for c in range(6):
+                        G[c * L + l] = 0.0
 
         for l in range(L):
             n = safe_normalize(wp.vec3(N[l], N[L + l], N[2 * L + l]))
             t = frame_tangent(n, wp.vec3(T[l], T[L + l], T[2 * L + l]))
             s = wp.cross(n, t) * T[3 * L + l]
-            v = safe_normalize(eye - wp.vec3(P[l], P[L + l], P[2 * L + l]))
+            v = safe_normalize(viewer.eye - wp.vec3(P[l], P[L + l], P[2 * L + l]))
             o = local_view(v, t, s, n)
             N[l] = n[0]
             N[L + l] = n[1]
@@ -172,6 +213,13 @@ def make_shade_kernel(functions_of, layout, lanes: int):
             O[l] = o[0]
             O[L + l] = o[1]
             O[2 * L + l] = o[2]
+        if wp.static(textured):
+            for l in range(L):
+                to = wp.vec3(P[l], P[L + l], P[2 * L + l]) - viewer.eye
+                gu = wp.vec3(G[l], G[L + l], G[2 * L + l])
+                gv = wp.vec3(G[3 * L + l], G[4 * L + l], G[5 * L + l])
+                rho2 = pixel_rho2(to, wp.dot(to, viewer.forward), viewer.right, viewer.down, gu, gv)
+                Q[2 * L + l] = wp.max(Q[2 * L + l], lod_of(rho2))
         for l in range(3 * L):
             R[l] = 0.0
             Y[l] = 0.0
@@ -181,7 +229,10 @@ def make_shade_kernel(functions_of, layout, lanes: int):
             if chosen[l] > 0.0:
                 active[wanted] = l
                 wanted += 1
-        view(material, O, active, wanted, own)
+        if wp.static(textured):
+            view(material, Q, O, active, wanted, own, R)
+        else:
+            view(material, O, active, wanted, own)
         total = int(0)
         for j in range(lights.count):
             source = wp.vec3(lights.position[3 * j], lights.position[3 * j + 1], lights.position[3 * j + 2])
@@ -193,7 +244,10 @@ def make_shade_kernel(functions_of, layout, lanes: int):
                 d = source - wp.vec3(P[l], P[L + l], P[2 * L + l])
                 w = to_local(safe_normalize(d), t, s, n)
                 # Inverse square; within a millionth of the unit of length the light is inside the surface.
-                e = chosen[l] * wp.max(w[2], 0.0) / wp.max(wp.dot(d, d), 1.0e-12)
+                gain = wp.max(w[2], 0.0)
+                if wp.static(textured):  # the cosine is that of the map's normal, which the material knows
+                    gain = wp.where(w[2] > 0.0, 1.0, 0.0)
+                e = chosen[l] * gain / wp.max(wp.dot(d, d), 1.0e-12)
                 I[l] = w[0]
                 I[L + l] = w[1]
                 I[2 * L + l] = wp.max(w[2], 0.0)

@@ -11,7 +11,7 @@ import numpy as np
 
 from warp_neumat.io.asset import read_asset
 
-KINDS = {"neubrdf": "warp_neumat.materials.neubrdf:NeuBRDF"}
+KINDS = {"bcf": "warp_neumat.materials.bcf:BCf", "neubrdf": "warp_neumat.materials.neubrdf:NeuBRDF"}
 """Where the class of each kind lives: a kind that a scene does not use is never imported, so never compiled."""
 
 
@@ -63,14 +63,33 @@ class Shader:
 
     Attributes:
         functions: ``functions(layout, lanes)`` gives the Warp functions ``view`` and ``light`` and the struct
-            ``Arguments`` for blocks of ``lanes`` lanes.
+            ``Arguments`` for blocks of ``lanes`` lanes. ``view`` is called once per sample, ``light`` for each light:
+
+            - ``view(arguments, wo, active, count, scratch)``, local ω_o [3][L];
+            - ``light(arguments, wi, active, count, scratch, value)``, local ω_i [3][L], writes the value [3][L] without
+              the cosine.
+
+            Those of a textured material know what varies over it, so they differ in two points:
+
+            - ``view(arguments, place, wo, active, count, scratch, emitted)``: ``place`` [3][L] is u, v and the mip
+              level, ``emitted`` [3][L] receives the radiance that needs no light (it comes as 0);
+            - ``light`` writes value × cosine with the normal that its maps say.
+
+            Either works for the first ``count`` lanes listed in ``active``, all above the local horizon; a light's
+            are among the view's, and for the rest of those it writes finite numbers.
         layout: Hashable compile-time layout with ``scratch(lanes)``, the float32 words a block needs.
         arguments: Instance of ``Arguments``: the material's device arrays.
+        texels: Width and height of the finest mip level of a textured material, which levels are counted from;
+            None = the material does not vary over the surface, and its kernel holds no code for uv.
+        share: ``share(layout, arguments)`` takes those of all materials of one layout and returns them with common
+            buffers.
     """
 
     functions: Callable
     layout: Hashable
     arguments: Any
+    texels: tuple[int, int] | None = None
+    share: Callable | None = None
 
 
 def load(path, *, device=None) -> Material:

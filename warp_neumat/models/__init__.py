@@ -10,7 +10,7 @@ config``, ``build(config, seed) -> model``, ``from_asset(tensors, config) -> mod
 import difflib
 import importlib
 
-REGISTRY = {"neubrdf": "warp_neumat.models.neubrdf"}
+REGISTRY = {"neubrdf": "warp_neumat.models.neubrdf", "bcf": "warp_neumat.models.bcf"}
 """Module of every model, by the name that ``neumat fit --model`` takes and assets carry as ``kind``."""
 
 

@@ -81,6 +81,12 @@ class Camera:
         """World position of the camera, shape (3,), float64."""
         return -self.view[:3, :3].T @ self.view[:3, 3]
 
+    def pixel_steps(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the unit view direction, and what one pixel to the right and one down add to a ray of view depth 1."""
+        step = 2.0 * math.tan(0.5 * self.fov_y) / self.height
+        right, up, back = self.view[:3, :3]
+        return -back, step * right, -step * up
+
     def clip(self) -> np.ndarray:
         """Return world → clip, shape (4, 4), float32, for column vectors."""
         scale = 1.0 / math.tan(0.5 * self.fov_y)

@@ -18,12 +18,13 @@ import numpy as np
 import warp as wp
 
 from warp_neumat.kernels import dispatch, gather, worklist
+from warp_neumat.kernels.lod import atlas_lod
 from warp_neumat.kernels.visibility import CameraRaster
 from warp_neumat.pipeline.atlas import Atlas
 from warp_neumat.pipeline.camera import CameraPath, load_camera
 from warp_neumat.pipeline.lights import PointLights, lights_from
 from warp_neumat.pipeline.sequence import MeshSequence
-from warp_neumat.pipeline.surface_mesh import SurfaceMesh, bind_materials, open_materials
+from warp_neumat.pipeline.surface_mesh import SurfaceMesh, bind_materials, map_sizes, open_materials
 from warp_neumat.pipeline.texel_shader import TexelShader
 
 SKIPS = ("unowned", "backfacing", "unseen")
@@ -138,7 +139,8 @@ class Renderer:
         self.lights = lights if isinstance(lights, PointLights) else lights_from(lights, lo, hi, frame_count)
         self.background = wp.vec3(*(float(c) for c in background))
 
-        self.mesh = SurfaceMesh(self.sequence, face_material, device=self.device)
+        self._map_size = map_sizes(self.sequence, face_material, self.materials)
+        self.mesh = SurfaceMesh(self.sequence, face_material, self._map_size, device=self.device)
         self.raster = CameraRaster(
             self.sequence.faces,
             self.sequence.vertex_count,
@@ -194,7 +196,7 @@ class Renderer:
             material = wp.array(material.ravel(), dtype=wp.uint8, device=self.device)
             corner_uv = wp.array(atlas.corner_uv.ravel(), dtype=wp.float32, device=self.device)
             barycentric = wp.array(atlas.barycentric, dtype=wp.float32, device=self.device)
-            self.shader = self._shader(triangle, barycentric, material)
+            self.shader = self._shader(triangle, barycentric, material, atlas)
             pixel = [pixel_triangle, pixel_barycentric, pixels, _PIXELS, corner_uv]
             self._mark = job(worklist.mark_seen_kernel, pixels, [*pixel, side, side], [self.shader.seen])
             self._mark_all = job(
@@ -218,8 +220,11 @@ class Renderer:
             )
         self._since = 0
 
-    def _shader(self, triangle, barycentric, material) -> TexelShader:
-        return TexelShader(self.mesh, self.materials, triangle, barycentric, material, len(self.lights))
+    def _shader(self, triangle, barycentric, material, atlas: Atlas | None = None) -> TexelShader:
+        lod = None
+        if atlas is not None and self._map_size is not None:
+            lod = atlas_lod(atlas.corner_uv, self.sequence.uv, self.sequence.faces, self._map_size)
+        return TexelShader(self.mesh, self.materials, triangle, barycentric, material, len(self.lights), lod)
 
     def per_pixel(self) -> "Renderer":
         """Return a renderer of the same shot that shades every pixel of every frame: the reference for this one."""
@@ -260,7 +265,7 @@ class Renderer:
         updated = self.space == "screen" or self._since == 0
         if updated:
             self.mesh.freeze(camera.eye)
-            self.shader.begin(camera.eye, position, intensity)
+            self.shader.begin(camera, position, intensity)
         self._since = 0 if self._since == self.interval else self._since + 1
         clock.stage("pose")
         self.raster.run(self.mesh.shown, camera.clip())

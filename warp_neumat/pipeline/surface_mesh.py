@@ -4,6 +4,7 @@ import numpy as np
 import warp as wp
 
 from warp_neumat.kernels import dispatch, worklist
+from warp_neumat.kernels.lod import uv_gradient_kernel
 from warp_neumat.materials.base import Material, load
 from warp_neumat.pipeline.sequence import MeshSequence
 
@@ -43,6 +44,25 @@ def bind_materials(sequence: MeshSequence, assignments: dict[str, Material]) -> 
     return [listed[k] for k in used], np.searchsorted(used, chosen)[sequence.face_mesh].astype(np.int32)
 
 
+def map_sizes(sequence: MeshSequence, face_material: np.ndarray, materials: list[Material]) -> np.ndarray | None:
+    """Return width and height [texel] of the maps on each face, (F, 2) float32, 0 where it has none; None = no maps.
+
+    Raises: ValueError: If a face with maps has no texture coordinates.
+    """
+    sizes = [material.shader().texels for material in materials]
+    if not any(sizes):
+        return None
+    known = np.isfinite(sequence.uv).all(axis=1)[sequence.faces].all(axis=1)
+    lost = np.flatnonzero(~known & np.array([size is not None for size in sizes])[face_material])
+    if len(lost):
+        part, material = sequence.mesh_names[sequence.face_mesh[lost[0]]], materials[face_material[lost[0]]]
+        raise ValueError(
+            f"{sequence.name}: {part!r} has no texture coordinates on {len(lost)} faces, which the maps of "
+            f"{material.name!r} need; unwrap it, or name a material without maps"
+        )
+    return np.array([size or (0, 0) for size in sizes], np.float32)[face_material]
+
+
 class SurfaceMesh:
     """Device arrays of a sequence, updated in place.
 
@@ -52,10 +72,13 @@ class SurfaceMesh:
     Args:
         sequence: The mesh sequence.
         face_material: Material index of each face, shape (F,).
+        map_size: Of :func:`map_sizes`; None leaves :attr:`uv` and :attr:`uv_gradient` out.
         device: Warp device.
     """
 
-    def __init__(self, sequence: MeshSequence, face_material: np.ndarray, *, device=None):
+    def __init__(
+        self, sequence: MeshSequence, face_material: np.ndarray, map_size: np.ndarray | None = None, *, device=None
+    ):
         self.sequence, self.device = sequence, wp.get_device(device)
         count, faces = sequence.vertex_count, len(sequence.faces)
         self.face_count = faces
@@ -71,6 +94,7 @@ class SurfaceMesh:
         self.side = array(faces, wp.int8)
         double = wp.array(sequence.face_double_sided.astype(np.uint8), dtype=wp.uint8, device=self.device)
         self._frame = self._shaded = None
+        self.uv = self.uv_gradient = None
         self._facing = dispatch.Job(
             worklist.facing_kernel,
             dispatch.blocks(faces, _FACES_PER_BLOCK),
@@ -78,6 +102,18 @@ class SurfaceMesh:
             outputs=[self.side],
             device=self.device,
         )
+        if map_size is not None:
+            self.uv = wp.array(np.nan_to_num(sequence.uv), dtype=wp.float32, device=self.device)
+            self.uv_gradient = array(6 * faces, wp.float32)
+            size = wp.array(map_size.ravel(), dtype=wp.float32, device=self.device)
+            inputs = [self.faces, faces, size, self.uv.flatten(), self.points.flatten(), self.side, _FACES_PER_BLOCK]
+            self._gradient = dispatch.Job(
+                uv_gradient_kernel,
+                dispatch.blocks(faces, _FACES_PER_BLOCK),
+                inputs=inputs,
+                outputs=[self.uv_gradient],
+                device=self.device,
+            )
 
     def show(self, index: int) -> None:
         """Move what the camera sees to frame ``index``."""
@@ -94,6 +130,8 @@ class SurfaceMesh:
             self._shaded = self._frame
         self._facing.set(4, wp.vec3(*(float(c) for c in eye)))
         self._facing.run()
+        if self.uv_gradient is not None:
+            self._gradient.run()
 
     def _write(self, target: wp.array, values: np.ndarray) -> None:
         if self.device.is_cpu:

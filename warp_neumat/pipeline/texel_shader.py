@@ -6,9 +6,11 @@ import numpy as np
 import warp as wp
 
 from warp_neumat.kernels import dispatch
-from warp_neumat.kernels.shade import WORDS, Lights, Surface, make_shade_kernel
+from warp_neumat.kernels.lod import NO_LOD
+from warp_neumat.kernels.shade import Lights, Surface, Viewer, make_shade_kernel, words
 from warp_neumat.kernels.worklist import list_kernel
-from warp_neumat.materials.base import Material
+from warp_neumat.materials.base import Material, Shader
+from warp_neumat.pipeline.camera import Camera
 from warp_neumat.pipeline.surface_mesh import SurfaceMesh
 
 
@@ -33,6 +35,8 @@ class TexelShader:
         barycentric: Weights of the second and third vertex, float32, shape (height, width, 2).
         texel_material: Material index + 1 of each texel, 0 = none, uint8, flat.
         light_capacity: Most lights that will shine.
+        least_lod: Mip level of one texel on each triangle, float32, shape (F,), where a texel is more than a point;
+            read for textured materials only.
     """
 
     def __init__(
@@ -43,6 +47,7 @@ class TexelShader:
         barycentric: wp.array,
         texel_material: wp.array,
         light_capacity: int,
+        least_lod: np.ndarray | None = None,
     ):
         self.height, self.width = triangle.shape
         self.device, self.materials = mesh.device, materials
@@ -70,6 +75,11 @@ class TexelShader:
         surface.faces, surface.side = mesh.faces, mesh.side
         surface.points, surface.normals = mesh.points.flatten(), mesh.normals.flatten()
         surface.tangents = mesh.tangents.flatten()
+        if mesh.uv_gradient is not None:
+            surface.uv, surface.uv_gradient = mesh.uv.flatten(), mesh.uv_gradient
+            if least_lod is None:
+                least_lod = np.full(mesh.face_count, NO_LOD, np.float32)
+            surface.least_lod = wp.array(least_lod, dtype=wp.float32, device=self.device)
         self._keep = (triangle, barycentric, texel_material, surface)
 
         self._lights = Lights()
@@ -79,18 +89,18 @@ class TexelShader:
         self._capacity = light_capacity
 
         self._lanes = dispatch.lanes(self.device)
-        shaders = [material.shader() for material in materials]
+        shaders = _shared([material.shader() for material in materials])
         blocks = dispatch.blocks(4 * self._quads.shape[0], self._lanes) + 1
         self._evaluations = zeros(blocks, wp.int32)
-        words = max(s.layout.scratch(self._lanes) for s in shaders) + WORDS * self._lanes
-        self._scratch_words = words if self._lanes > 1 else 0
+        most = max(words(s.layout, self._lanes, s.texels is not None) for s in shaders)
+        self._scratch_words = most if self._lanes > 1 else 0
         self._workers = dispatch.worker_count()
         self._scratch = zeros(max(1, self._workers * self._scratch_words), wp.float32)
         self._jobs = [
             dispatch.Job(
-                make_shade_kernel(s.functions, s.layout, self._lanes),
+                make_shade_kernel(s.functions, s.layout, self._lanes, s.texels is not None),
                 1,
-                inputs=[s.arguments, self._quads, 1, surface, self._lights, wp.vec3(), self._scratch],
+                inputs=[s.arguments, self._quads, 1, surface, self._lights, Viewer(), self._scratch],
                 outputs=[self.radiance, self._evaluations],
                 device=self.device,
                 grain=1,
@@ -104,11 +114,11 @@ class TexelShader:
         self.seen = seen
         self._list_job.set(0, seen)
 
-    def begin(self, eye, position: np.ndarray, intensity: np.ndarray) -> None:
+    def begin(self, camera: Camera, position: np.ndarray, intensity: np.ndarray) -> None:
         """Begin an epoch: nothing is shaded yet, and viewer and lights are these until the next one.
 
         Args:
-            eye: Position of the viewer, shape (3,).
+            camera: The viewer, whose pixels are the footprints that textures are filtered for.
             position: Positions of the lights, shape (L, 3).
             intensity: Radiant intensities [W/sr], shape (L, 3).
         """
@@ -120,9 +130,12 @@ class TexelShader:
             padded[: 3 * count] = np.asarray(values, np.float32).ravel()
             target.assign(padded)
         self._lights.count = count
+        viewer = Viewer()
+        viewer.eye = wp.vec3(*map(float, camera.eye))
+        viewer.forward, viewer.right, viewer.down = (wp.vec3(*map(float, v)) for v in camera.pixel_steps())
         for job in self._jobs:
             job.set(4, self._lights)
-            job.set(5, wp.vec3(*(float(c) for c in eye)))
+            job.set(5, viewer)
         self._done.zero_()
 
     def list(self) -> ListCounts:
@@ -161,3 +174,16 @@ class TexelShader:
             job.run(blocks)
             evaluations += int(self._evaluations[:blocks].numpy().sum(dtype=np.int64))
         return evaluations
+
+
+def _shared(shaders: list[Shader]) -> list[Shader]:
+    """Return ``shaders`` where those of one layout have their buffers in common, if their kind knows how."""
+    groups: dict = {}
+    for k, shader in enumerate(shaders):
+        if shader.share is not None:
+            groups.setdefault((shader.share, shader.layout), []).append(k)
+    result = list(shaders)
+    for (share, layout), members in groups.items():
+        for k, arguments in zip(members, share(layout, [shaders[k].arguments for k in members]), strict=True):
+            result[k] = dataclasses.replace(shaders[k], arguments=arguments)
+    return result

@@ -10,7 +10,9 @@ def _unit(v):
     return v / np.linalg.norm(v, axis=-1, keepdims=True)
 
 
-def shade(points, normals, tangents, corner_weights, eye, position, intensity, evaluate) -> np.ndarray:
+def shade(
+    points, normals, tangents, corner_weights, eye, position, intensity, evaluate, *, projected=False
+) -> np.ndarray:
     """Return the radiance of samples on triangles, (N, 3) float64.
 
     Args:
@@ -18,7 +20,8 @@ def shade(points, normals, tangents, corner_weights, eye, position, intensity, e
         corner_weights: Barycentric weights of the three vertices, (N, 3).
         eye: Position of the viewer, (3,).
         position, intensity: Of the lights, (L, 3) each.
-        evaluate: ``evaluate(wi, wo) -> (N, 3)``, BRDF without the cosine; local directions.
+        evaluate: ``evaluate(wi, wo) -> (N, 3)``, BRDF without the cosine; local directions. With ``projected``, it is
+            ``evaluate(wi, wo, lit)``, ``lit`` says which of the N samples are asked for, and the cosine is included.
     """
     weights = np.asarray(corner_weights, np.float64)[..., None]
     p = (np.asarray(points, np.float64) * weights).sum(1)
@@ -36,6 +39,32 @@ def shade(points, normals, tangents, corner_weights, eye, position, intensity, e
         d = at - p
         wi = np.einsum("nij,nj->ni", frame, _unit(d))
         lit = wi[:, 2] > 0
-        cosine = wi[lit, 2:] / (d[lit] ** 2).sum(1, keepdims=True)
-        radiance[lit] += evaluate(wi[lit], wo[lit]) * cosine * power
+        irradiance = power / (d[lit] ** 2).sum(1, keepdims=True)
+        if projected:
+            radiance[lit] += evaluate(wi[lit], wo[lit], lit) * irradiance
+        else:
+            radiance[lit] += evaluate(wi[lit], wo[lit]) * wi[lit, 2:] * irradiance
     return radiance
+
+
+def pixel_lod(points, uv, ray, x, y, texels) -> np.ndarray:
+    """Return log₂ of the longer derivative of (u W, v H) by a pixel, (N,), from rays a thousandth of a pixel apart.
+
+    Args:
+        points, uv: Of the samples' three vertices, (N, 3, 3) and (N, 3, 2).
+        ray: ``ray(x, y)`` gives the eye and a direction through each picture point, as ``Camera.ray``.
+        x, y: Where the samples lie in the picture [px], (N,).
+        texels: W and H.
+    """
+    points, uv = np.asarray(points, np.float64), np.asarray(uv, np.float64)
+    edges = points[:, 1:] - points[:, :1]
+
+    def at(dx, dy):
+        eye, direction = ray(x + dx, y + dy)
+        matrix = np.concatenate([edges, -direction[:, None]], axis=1).transpose(0, 2, 1)
+        b1, b2 = np.linalg.solve(matrix, (eye - points[:, 0])[..., None])[:, :2, 0].T
+        return (uv * np.stack([1 - b1 - b2, b1, b2], 1)[..., None]).sum(1) * texels
+
+    h = 5e-4
+    derivatives = [(at(h, 0) - at(-h, 0)) / (2 * h), (at(0, h) - at(0, -h)) / (2 * h)]
+    return np.log2(np.max([np.linalg.norm(d, axis=1) for d in derivatives], axis=0))

@@ -7,17 +7,23 @@ leave a checkpoint beside the output and go on from there with ``resume=True``.
 from __future__ import annotations
 
 import difflib
+import math
 import os
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from warp_neumat import models
 from warp_neumat.io.asset import write_asset
 from warp_neumat.io.atomic import check_writable
 from warp_neumat.io.brdf import open_brdf
+from warp_neumat.io.texture_set import open_texture_set
+from warp_neumat.materials.bcf import BCf as BCfMaterial
 from warp_neumat.training import losses, samplers
+from warp_neumat.training.block_loop import BlockTrainer
 from warp_neumat.training.evaluate import brdf_metrics
+from warp_neumat.training.evaluate_maps import sample_grid
 from warp_neumat.training.loop import Plan, Trainer
 
 PRESETS = {"quick": 0.3, "standard": 1.0, "fine": 4.0}
@@ -27,17 +33,73 @@ PRESETS = {"quick": 0.3, "standard": 1.0, "fine": 4.0}
 class BRDFData:
     """What a fit does with sources of kind ``brdf``; the pattern for other kinds."""
 
+    OPTIONS = ()
+    """Keyword arguments of :func:`fit` that belong to the source."""
     open = staticmethod(open_brdf)
     loss = staticmethod(losses.LogCosine)
-    metrics = staticmethod(brdf_metrics)
+
+    @staticmethod
+    def configured(module, source, preset, options):
+        """Return (length factor, batch, config of the model)."""
+        return _length(preset, PRESETS), Plan.batch, module.configure(source, options)
 
     @staticmethod
     def sampler(source):
         """Return ``sampler(rng, count)`` for :class:`warp_neumat.training.loop.Trainer`."""
         return lambda rng, count: samplers.BRDFSampler(source, rng).draw(count)
 
+    @classmethod
+    def trainer(cls, module, source, shape, plan, device, **more):
+        """Return what ``run`` and ``resume`` are called on."""
+        trained = module.build(shape, plan.seed).to(device)
+        return Trainer(trained, cls.sampler(source), cls.loss(), plan, **more)
 
-DATA = {"brdf": BRDFData}
+    @staticmethod
+    def stored(module, source, trainer) -> tuple[dict, dict, dict]:
+        """Return (tensors, header, metrics) of the trained model, measured on what will be stored."""
+        tensors, header = trainer.model.cpu().to_asset()
+        metrics = brdf_metrics(source, module.from_asset(tensors, header["config"]).evaluate)
+        return tensors, header, metrics
+
+
+class MapData:
+    """What a fit does with sources of kind ``maps``: folders of PBR textures."""
+
+    OPTIONS = ("size", "crop", "overrides")
+    BATCH = 16384
+    open = staticmethod(open_texture_set)
+
+    @staticmethod
+    def configured(module, source, preset, options):
+        """Return (length factor, batch, config); a preset names the sizes of the features, or the length."""
+        length = preset if preset in PRESETS else None
+        batch = options.pop("batch", MapData.BATCH)
+        if isinstance(batch, bool) or not isinstance(batch, int) or batch < 256 or batch % 256:
+            raise ValueError(f"batch must be a multiple of 256, got {batch!r}")
+        if preset is not None and length is None:
+            _length(preset, {**PRESETS, **module.PRESETS})
+            return 1.0, batch, module.configure(source, options, preset)
+        return _length(length, PRESETS), batch, module.configure(source, options)
+
+    @staticmethod
+    def trainer(module, source, shape, plan, device, *, checkpoint, **more):
+        """Return the trainer of the texture set."""
+        if torch.device(device).type != "cpu":
+            raise ValueError(f"bcf trains on the CPU, got device {device}; render with it on any device")
+        mips = source.mips()
+        mean = mips[0].reshape(-1, mips[0].shape[2]).mean(axis=0)
+        return BlockTrainer(module.build(shape, plan.seed, mean), mips, plan, checkpoint_path=checkpoint, **more)
+
+    @staticmethod
+    def stored(module, source, trainer) -> tuple[dict, dict, dict]:
+        """Return (tensors, header, metrics); metrics hold the PSNR averaged over mips, as the paper does."""
+        tensors, header = trainer.model.to_asset(trainer.packed)
+        material = BCfMaterial(tensors, header, path=Path(source.name), device="cpu")
+        header["maps"] = {"files": source.files, "notes": list(source.notes)}
+        return tensors, header, {"psnr": _mean_psnr(trainer.mips, material.encoded)}
+
+
+DATA = {"brdf": BRDFData, "maps": MapData}
 
 
 def checkpoint_path(out: Path) -> Path:
@@ -64,17 +126,19 @@ def fit(
     The returned ``header["training"]["seconds"]`` is not in the file.
 
     Args:
-        source: As for :func:`warp_neumat.io.brdf.open_brdf`.
+        source: As for :func:`warp_neumat.io.brdf.open_brdf`, or for model ``bcf`` as for
+            :func:`warp_neumat.io.texture_set.open_texture_set`.
         out: The ``.neumat`` file to write; replaced if it exists. Its folder must exist.
         model: Name in :data:`warp_neumat.models.REGISTRY`.
         steps: Optimiser steps; default: the model's, times the preset's factor.
         seed: Same seed, same file (on one machine with the same number of threads).
         device: torch device.
-        preset: One of :data:`PRESETS`.
+        preset: One of :data:`PRESETS`; for ``bcf`` also one of :data:`warp_neumat.models.bcf.PRESETS`.
         resume: Go on from the checkpoint beside ``out`` where there is one.
         progress: ``progress(fraction, text)``.
         budget_seconds: Train for this time instead of ``steps``; then the tensors depend on the machine's speed.
-        config: Fields of the model's config, as ``nside=32``.
+        config: Fields of the model's config, as ``nside=32`` or ``features=(256, 128, 64, 32)``; for ``bcf`` also
+            ``batch`` and the keyword arguments of ``open_texture_set``.
 
     Raises:
         ValueError: If the source, an option or the checkpoint does not fit; names it and the nearest valid one.
@@ -84,35 +148,30 @@ def fit(
     out = Path(out)
     module = models.find(model)
     kind = DATA[module.DATA]
-    opened = kind.open(source)
-    shape = module.configure(opened, config)
-    plan = Plan(steps=_step_count(module, steps, preset), seed=_whole("seed", seed, 0), budget_seconds=budget_seconds)
+    opening = {name: config.pop(name) for name in kind.OPTIONS if name in config}
+    seed = _whole("seed", seed, 0)
     if budget_seconds is not None and not budget_seconds > 0:
         raise ValueError(f"budget_seconds must be above 0, got {budget_seconds}")
+    opened = kind.open(source, **opening)
+    factor, batch, shape = kind.configured(module, opened, preset, dict(config))
+    steps = round(module.DEFAULT_STEPS * factor) if steps is None else _whole("steps", steps, 1)
+    plan = Plan(steps=steps, batch=batch, seed=seed, budget_seconds=budget_seconds)
     check_writable(out)  # now, not after minutes of training
     threads = torch.get_num_threads()
     torch.set_num_threads(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
     try:
-        trained = module.build(shape, seed).to(_device(device))
-        trainer = Trainer(
-            trained,
-            kind.sampler(opened),
-            kind.loss(),
-            plan,
-            checkpoint=checkpoint_path(out),
-            identity={"source": source, "model": model, "config": repr(shape)},
-            progress=progress,
-        )
+        identity = {"source": _named(source), "opening": repr(opening), "model": model, "config": repr(shape)}
+        more = {"checkpoint": checkpoint_path(out), "identity": identity, "progress": progress}
+        trainer = kind.trainer(module, opened, shape, plan, _device(device), **more)
         if resume and not trainer.resume() and progress:
             progress(0.0, "no checkpoint to resume: starting anew")
         facts = trainer.run()
-        tensors, header = trained.cpu().to_asset()
+        tensors, header, metrics = kind.stored(module, opened, trainer)
         size = sum(tensor.nbytes for tensor in tensors.values())
-        stored = module.from_asset(tensors, header["config"])
-        header["source"] = {"spec": source, "name": opened.name}
+        header["source"] = {"spec": _named(source), "name": opened.name}
         seconds = facts.pop("seconds")  # returned, but not stored: the same seed gives the same file
-        header["training"] = {**facts, **trained.statistics()}
-        header["metrics"] = {**kind.metrics(opened, stored.evaluate), "bytes": size}
+        header["training"] = {**facts, **trainer.model.statistics()}
+        header["metrics"] = {**metrics, "bytes": size}
         write_asset(out, tensors, header)
         header["training"]["seconds"] = seconds
     finally:
@@ -129,13 +188,26 @@ def _whole(name: str, value, least: int) -> int:
     return value
 
 
-def _step_count(module, steps, preset) -> int:
-    if preset is not None and preset not in PRESETS:
-        close = difflib.get_close_matches(preset, PRESETS, n=1, cutoff=0.0)[0]
-        raise ValueError(f"no preset {preset!r}; nearest: {close}; known: {', '.join(PRESETS)}")
-    if steps is not None:
-        return _whole("steps", steps, 1)
-    return round(module.DEFAULT_STEPS * PRESETS[preset or "standard"])
+def _length(preset, known: dict) -> float:
+    if preset is not None and preset not in known:
+        close = difflib.get_close_matches(preset, known, n=1, cutoff=0.0)[0]
+        raise ValueError(f"no preset {preset!r}; nearest: {close}; known: {', '.join(known)}")
+    return known[preset or "standard"] if preset in PRESETS or preset is None else 1.0
+
+
+def _mean_psnr(mips, encoded) -> float:
+    """Return the PSNR [dB] of the squared error averaged over channels and mips, each mip counting the same."""
+    errors = []
+    for level, picture in enumerate(mips):
+        height, width, channels = picture.shape
+        decoded = sample_grid(encoded, height, width, channels, float(level))
+        errors.append(float(np.square(decoded - picture).mean(dtype=np.float64)))
+    return round(-10.0 * math.log10(max(np.mean(errors), 1e-12)), 4)
+
+
+def _named(source) -> str:
+    """Return a source as text, for the header; manifests may come as dictionaries."""
+    return source if isinstance(source, str) else os.fspath(source) if hasattr(source, "__fspath__") else "manifest"
 
 
 def _device(name: str) -> torch.device:

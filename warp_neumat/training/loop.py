@@ -7,18 +7,14 @@ gives the same tensors, and a run resumed from a checkpoint goes on exactly as i
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 import time
 from pathlib import Path
 
 import numpy as np
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
 
-from warp_neumat.io.asset import FormatError
-from warp_neumat.io.atomic import replacing
+from warp_neumat.training import checkpoint
 
 CHUNK = 16
 """Batches that are drawn at once, and gone through :data:`PASSES` times before the next are drawn."""
@@ -130,7 +126,8 @@ class Trainer:
         parameters = self.model.trainable(name)
         optimiser = torch.optim.Adam(parameters, lr=stage["lr"][0], betas=(0.9, 0.99), eps=1e-10, fused=True)
         if self._pending is not None:
-            self._restore_optimiser(optimiser, parameters)
+            checkpoint.restore_optimiser(optimiser, parameters, self._pending)
+            self._pending = None
         chunk, order, length = None, None, CHUNK * self.plan.batch
         while (position := self._position(stage)) < 1.0:
             within = self._step % (CHUNK * PASSES)
@@ -179,14 +176,10 @@ class Trainer:
         return {"plan": dataclasses.asdict(self.plan), **self.identity}
 
     def _save(self, optimiser, parameters) -> None:
-        tensors = {f"model.{name}": value.contiguous() for name, value in self.model.state_dict().items()}
-        for number, parameter in enumerate(parameters):
-            for key, value in optimiser.state.get(parameter, {}).items():
-                tensors[f"optimiser.{number}.{key}"] = value.contiguous()
+        tensors = {f"model.{name}": value for name, value in self.model.state_dict().items()}
+        tensors |= checkpoint.optimiser_tensors(optimiser, parameters)
         state = {"stage": self._stage, "step": self._step, "event": self._event, "elapsed": self._elapsed}
-        metadata = {"state": json.dumps(state), "facts": json.dumps(self._facts(), sort_keys=True)}
-        with replacing(self.checkpoint) as temporary:
-            temporary.write_bytes(save(tensors, metadata=metadata))
+        checkpoint.save(self.checkpoint, tensors, state, self._facts())
 
     def resume(self) -> bool:
         """Load the checkpoint; return False if there is none.
@@ -196,30 +189,10 @@ class Trainer:
         """
         if self.checkpoint is None or not self.checkpoint.is_file():
             return False
-        anew = "fit again without --resume"
-        try:
-            with safe_open(self.checkpoint, framework="pt") as file:
-                metadata = file.metadata() or {}
-                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-            state, facts = json.loads(metadata["state"]), json.loads(metadata["facts"])
-        except (SafetensorError, KeyError, json.JSONDecodeError) as error:
-            raise FormatError(self.checkpoint, "file", f"no readable checkpoint ({error})", anew) from None
-        mine = json.loads(json.dumps(self._facts()))
-        for key in mine.keys() | facts.keys():
-            if mine.get(key) != facts.get(key):
-                rule = f"was {facts.get(key)!r} when it was saved, now {mine.get(key)!r}"
-                raise FormatError(self.checkpoint, key, rule, f"use the same settings, or {anew}")
+        tensors, state = checkpoint.load(self.checkpoint, self._facts())
         model = {name.removeprefix("model."): value for name, value in tensors.items() if name.startswith("model.")}
         self.model.load_state_dict(model)
         self._stage, self._step, self._event = state["stage"], state["step"], state["event"]
         self._elapsed = state["elapsed"]
         self._pending = {name: value for name, value in tensors.items() if name.startswith("optimiser.")}
         return True
-
-    def _restore_optimiser(self, optimiser, parameters) -> None:
-        for number, parameter in enumerate(parameters):
-            prefix = f"optimiser.{number}."
-            state = {k.removeprefix(prefix): v for k, v in self._pending.items() if k.startswith(prefix)}
-            if state:
-                optimiser.state[parameter] = state
-        self._pending = None

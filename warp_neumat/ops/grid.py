@@ -1,7 +1,4 @@
-"""The bridge between torch and Warp: custom operators ``torch.ops.neumat.*``.
-
-Each has a registered shape function, so that it works under ``torch.compile`` and passes ``torch.library.opcheck``.
-"""
+"""Look-ups in the corner grid of NeuBRDF: HEALPix corners, weighted gathers of rows, and their transpose."""
 
 import functools
 
