@@ -10,6 +10,7 @@ import difflib
 import importlib
 import json
 import math
+import os
 import sys
 from collections.abc import Iterable
 from pathlib import Path
@@ -21,6 +22,9 @@ from rich.table import Table
 from warp_neumat.io.atomic import check_writable, replacing
 
 from .harness import machine, versions
+
+# Before torch and FLIP load their OpenMP: threads that spin while they wait cost a busy machine many times their gain.
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 _NOT_BENCHMARKS = {"__init__", "__main__", "harness"}
 

@@ -110,6 +110,14 @@ class Lab:
                 baseline = self.baseline(name, method)
                 found = compare(opened.channels, mips, (baseline.level(m) for m in range(len(mips))))
                 size, seconds = baseline.bytes, None
+            elif config and "quantise" in config:
+                from ._quantised import QuantisedFeatures
+
+                channels, bits, scale = config["quantise"]
+                material = QuantisedFeatures(
+                    opened, mips, channels=channels, bits=bits, scale=scale, steps=self.choice.steps, seed=self.choice.seed
+                )
+                found, size, seconds = map_metrics(opened, material.encoded), material.bytes, None
             else:
                 material, seconds = self.material(name, method if config is None else "BCf-1k", config or {})
                 found, size = map_metrics(opened, material.encoded), material.bytes

@@ -10,7 +10,7 @@ which ``python -m bench.bcf`` takes a choice (``--help``), as of sets, crop and 
   of the training (bicubic in the two nearest mips, linear between); ``psnr_area`` is against the finest mip filtered
   over the area of a pixel, what a picture of that size should show. A plot of the first set.
 - ``options``: the trainer's options one by one; ``gain`` is against its defaults.
-- ``figure13``: features that are quantised instead of compressed, n channels of q bits; only if it is chosen.
+- ``figure13``: features that are quantised instead of compressed, n channels of q bits; runs only if chosen.
 
 PSNR counts every mip the same; ``psnr_texels`` every texel, ``psnr_mip0`` the finest mip alone. Fitted files stay in
 the output folder and are used again while their options are the same; ``seconds`` is the fit's time, where it was now.
@@ -34,21 +34,36 @@ COLUMNS = [
     "table", "set", "method", "scale", "bytes", "psnr", "psnr_texels", "psnr_mip0", "ssim", "flip", "gain", "seconds",
 ]  # fmt: skip
 
+_PAPER = {
+    "quantisation": "once", "modes": "single", "sensitivity": False, "mip_decay": 0.0, "aligned": 0.0, "smallest_mip": 4,
+}  # fmt: skip
+
 OPTIONS = {
     "defaults": {},
     "random partitions, no warm-up": {"warmup": False},
-    "quantised at the end": {"qat": False},
-    "partitions chosen once": {"repartition": False},
+    "quantised at the end": {"quantisation": "once"},
+    "quantised all at once": {"quantisation": "straight-through"},
+    "partitions chosen anew": {"repartition": 2},
+    "all texels encoded alike": {"sensitivity": False},
     "mode 10 only": {"modes": "single"},
     "all mips sampled alike": {"mip_decay": 0.0},
+    "no samples on texel centres": {"aligned": 0.0},
     "last mip 4x4": {"smallest_mip": 4},
     "channels weighted by variance": {"channel_weights": "variance"},
-    "as the paper": {"qat": False, "repartition": False, "modes": "single", "mip_decay": 0.0, "smallest_mip": 4},
-}
+    "as the paper": {
+        "quantisation": "once", "sensitivity": False, "modes": "single", "mip_decay": 0.0, "aligned": 0.0,
+        "smallest_mip": 4,
+    },
+}  # fmt: skip
 """Method → what differs from the defaults of the fit, with the preset of BCf-1k."""
 
-QUANTISED = {f"{n} channels x {q} bit": {"quantise": (n, q)} for n, q in ((4, 2), (5, 4), (8, 4), (3, 8))}
-"""Method → config for features that are quantised and not block-compressed."""
+QUANTISED = {
+    "3 channels x 2 bit": {"quantise": (3, 2, 1.0)},
+    "3 channels x 3 bit": {"quantise": (3, 3, 1.0)},
+    "6 channels x 4 bit, half the side": {"quantise": (6, 4, 0.5)},
+    "6 channels x 4 bit": {"quantise": (6, 4, 1.0)},
+}
+"""Method → (channels, bits, scale of the sides) of features that are quantised and not block-compressed (8 bit)."""
 
 _SCALE_STEP = 0.25
 

@@ -3,9 +3,12 @@
 import os
 from pathlib import Path
 
-import numpy as np
-import pytest
-import warp as wp
+# Before torch and FLIP load their OpenMP: threads that spin while they wait cost a busy machine many times their gain.
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
+import numpy as np  # noqa: E402
+import pytest  # noqa: E402
+import warp as wp  # noqa: E402
 
 wp.config.log_level = wp.LOG_WARNING
 
@@ -34,3 +37,22 @@ def rng() -> np.random.Generator:
 def device(request):
     """Every device of this machine: the CPU, and the GPUs where there are any."""
     return str(request.param)
+
+
+@pytest.fixture
+def run(capsys, monkeypatch, tmp_path):
+    """``run("render", …)`` returns (exit code, stdout, stderr); the atlas cache is the test's own."""
+    from warp_neumat.cli import main
+
+    monkeypatch.setenv("NEUMAT_CACHE", str(tmp_path / "cache"))
+
+    def call(*arguments):
+        try:
+            main([str(a) for a in arguments])
+            code = 0
+        except SystemExit as stop:
+            code = stop.code or 0
+        out, err = capsys.readouterr()
+        return code, out, err
+
+    return call

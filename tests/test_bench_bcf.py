@@ -84,8 +84,8 @@ def test_all_tables_from_few_fits(tmp_path, source, fits, monkeypatch):
     first = fits[0]
     assert first == {"size": (32, 32), "preset": "1k", "steps": 7}
     assert fits[1]["preset"] == "2k++"
-    # Two presets, the options that differ from the default, and the quantised ones; nothing twice.
-    assert len(fits) == 2 + len(bcf.OPTIONS) - 1 + len(bcf.QUANTISED)
+    # Two presets and the options that differ from the default, nothing twice; quantised ones are not fits.
+    assert len(fits) == 2 + len(bcf.OPTIONS) - 1
     assert {"figure8.png", "figure10.png"} <= {path.name for path in (tmp_path / "out").iterdir()}
     table = {(row["set"], row["method"]): row for row in rows if row["table"] == "table2"}
     assert table["mean", "bc_half"]["gain"] == 0
@@ -95,8 +95,18 @@ def test_all_tables_from_few_fits(tmp_path, source, fits, monkeypatch):
     assert [row["scale"] for row in curve] == [0.25 * k for k in range(12)]
     assert curve[0]["psnr"] == pytest.approx(table["maps", "bc_full"]["psnr_mip0"])
     again = list(bcf.rows(device="cpu", quick=False, **{**choice, "only": ("table2",)}))
-    assert len(fits) == 2 + len(bcf.OPTIONS) - 1 + len(bcf.QUANTISED)
+    assert len(fits) == 2 + len(bcf.OPTIONS) - 1
     assert [row["psnr"] for row in again] == [row["psnr"] for row in rows if row["table"] == "table2"]
+
+
+def test_options_are_fields_of_the_model(source):
+    pytest.importorskip("torch")
+    from warp_neumat.models.bcf import configure
+
+    opened = open_texture_set(source)
+    defaults = configure(opened, {})
+    for name, options in bcf.OPTIONS.items():
+        assert (configure(opened, options) == defaults) == (name == "defaults"), name
 
 
 def test_mean_psnr_is_that_of_the_mean_error():

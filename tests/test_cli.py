@@ -9,26 +9,8 @@ import numpy as np
 import pytest
 
 from tests.fake_assets import random_neubrdf
-from warp_neumat.cli import main
 from warp_neumat.io.asset import write_asset
 from warp_neumat.io.image import read_image
-
-
-@pytest.fixture
-def run(capsys, monkeypatch, tmp_path):
-    """``run("render", …)`` returns (exit code, stdout, stderr); the atlas cache is the test's own."""
-    monkeypatch.setenv("NEUMAT_CACHE", str(tmp_path / "cache"))
-
-    def call(*arguments):
-        try:
-            main([str(a) for a in arguments])
-            code = 0
-        except SystemExit as stop:
-            code = stop.code or 0
-        out, err = capsys.readouterr()
-        return code, out, err
-
-    return call
 
 
 @pytest.fixture
@@ -222,5 +204,5 @@ def test_unwritable_folder_is_one_line(run, scene):
 def test_help_is_quick_and_names_the_commands():
     done = subprocess.run([sys.executable, "-m", "warp_neumat", "--help"], capture_output=True, text=True, timeout=60)
     assert done.returncode == 0
-    for command in ("demo", "eval", "fit", "info", "render"):
+    for command in ("decode", "demo", "eval", "export", "fit", "info", "render"):
         assert command in done.stdout

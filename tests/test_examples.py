@@ -35,5 +35,15 @@ def test_evaluate_material_prints_a_metal(capsys):
     assert "degrees" in capsys.readouterr().out
 
 
+def test_fit_textures_fits_and_exports(tmp_path, capsys):
+    pytest.importorskip("torch")
+    header = _load("fit_textures").main(["--steps", "200", "--out", str(tmp_path / "out")])
+    assert header["metrics"]["psnr"] > 18
+    assert (tmp_path / "out" / "engine" / "tile_features0.dds").is_file()
+    printed = capsys.readouterr().out
+    assert "6 channels to learn" in printed
+    assert "mip 2.5:" in printed
+
+
 def test_every_example_is_tested():
-    assert {f.stem for f in FOLDER.glob("*.py")} == {"render_sequence", "evaluate_material"}
+    assert {f.stem for f in FOLDER.glob("*.py")} == {"render_sequence", "evaluate_material", "fit_textures"}

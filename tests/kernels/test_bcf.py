@@ -16,7 +16,7 @@ from warp_neumat.reference.bc6h import bc6h_decode
 
 # Each row: signed, wrap, textures. Sides are odd, or not square, or one texel; the last has another number of textures.
 CASES = {
-    "repeat": {"signed": False, "wrap": "repeat", "features": (32, 16, 8, 4), "size": 64},
+    "repeat": {"signed": False, "wrap": "repeat", "features": (32, (30, 18), (9, 7), 4), "size": 64},
     "mirror": {"signed": True, "wrap": "mirror", "features": ((33, 20), 16, (5, 7), 1), "size": (66, 40)},
     "clamp": {"signed": False, "wrap": "clamp", "features": ((13, 6), 24), "size": 24, "channels": 16},
 }
@@ -67,6 +67,9 @@ def inputs(rng, count):
     lod = (rng.random(count) * 9 - 1.5).astype(np.float32)
     lod[::5] = np.floor(lod[::5])  # one mip alone
     lod[:64] = -1.0  # whole groups of lanes without a second mip
+    near = slice(64, min(count, 256))  # neighbours, which share blocks
+    uv[near] = uv[64] + np.arange(near.stop - 64)[:, None] * np.float32(0.004)
+    lod[near] = 0.4
     return uv, lod
 
 
@@ -75,8 +78,8 @@ def test_storages_hold_what_the_reference_decodes(rng, signed):
     blocks = rng.integers(0, 256, (20_000, 16), dtype=np.uint8)  # all modes, reserved ones too
     wide = bcf_storage.unquantise(blocks, signed)
     words = np.ascontiguousarray(wide[:, :32]).view(np.int16).reshape(-1, 2, 8)[:, :, :6].astype(np.int64)
-    pair = words[np.arange(len(blocks))[:, None], wide[:, 33::2] // 16]
-    factor = bcf_storage.weights().astype(np.int64)[wide[:, 32::2] // 4]
+    pair = words[np.arange(len(blocks))[:, None], (wide[:, 33::2] + 2 * np.arange(16) - 32) // 16]
+    factor = bcf_storage.weights().astype(np.int64)[wide[:, 32::2] // 2]
     value = pair.reshape(-1, 16, 3, 2) @ factor[:, :, :, None]
     value = value[..., 0]
     if signed:

@@ -184,7 +184,7 @@ BAD = {
     ),
     "config.channels: must list 1 to 16": spoil(lambda t, c: c.update(channels=c["channels"] * 2)),
     r"config.channels\[0\].map: must be a name": spoil(lambda t, c: c["channels"][0].pop("map")),
-    r"config.channels\[3\].component: must be one of b, g, r, value, x, y, got 'z'": spoil(
+    r"config.channels\[3\].component: must be one of a, b, g, r, value, x, y, got 'z'": spoil(
         lambda t, c: c["channels"][3].update(component="z")
     ),
     r"config.channels\[0\].encoding: must be one of linear, srgb, normal, got 'sRGB'": spoil(
@@ -193,7 +193,7 @@ BAD = {
     r"config.channels\[5\].range: must be 2 finite numbers, got \[0.0, nan\]": spoil(
         lambda t, c: c["channels"][5].update(range=[0.0, float("nan")])
     ),
-    "components of base_color must be value, or x and y, or r, g and b, got b, g": spoil(
+    r"components of base_color must be value, x y, or r g \(b \(a\)\), got b, g": spoil(
         lambda t, c: c["channels"].pop(0)
     ),
     "normal must have one encoding, normal for x and y alone, got linear, normal": spoil(

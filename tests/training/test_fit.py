@@ -10,7 +10,7 @@ from warp_neumat.io.brdf import open_brdf  # noqa: E402
 from warp_neumat.models import neubrdf  # noqa: E402
 from warp_neumat.reference.neubrdf import reference_eval  # noqa: E402
 from warp_neumat.training import fit as fitting  # noqa: E402
-from warp_neumat.training.fit import checkpoint_path, fit  # noqa: E402
+from warp_neumat.training.fit import checkpoint_path, default_model, fit, presets  # noqa: E402
 from warp_neumat.training.loop import Plan, Trainer  # noqa: E402
 from warp_neumat.training.losses import LogCosine  # noqa: E402
 from warp_neumat.training.sphere import render_sphere, sphere_error  # noqa: E402
@@ -62,6 +62,14 @@ def test_same_seed_same_tensors_other_seed_others():
         runs.append(trainer.model.to_asset()[0])
     assert all(np.array_equal(runs[0][name], runs[1][name]) for name in runs[0])
     assert not np.array_equal(runs[0]["indices"], runs[2]["indices"])
+
+
+def test_the_model_follows_the_source(tmp_path):
+    assert default_model(tmp_path) == default_model(str(tmp_path)) == "bcf"
+    assert default_model({"maps": {}}) == default_model("set.JSON") == "bcf"
+    assert default_model(SOURCE) == default_model("brdfs.npz:gold") == "neubrdf"
+    assert presets("neubrdf") == ("quick", "standard", "fine")
+    assert presets("bcf")[:4] == ("0.5k", "1k", "2k", "2k++")
 
 
 @pytest.mark.parametrize("interrupted_in", ["features", "codebook", "round"])
@@ -127,6 +135,8 @@ def test_divergence_is_an_error():
         ({"steps": 0}, ValueError, "steps must be a whole number of at least 1"),
         ({"seed": -1}, ValueError, "seed must be"),
         ({"budget_seconds": -2.0}, ValueError, "budget_seconds must be above 0"),
+        ({"checkpoint_seconds": -1.0}, ValueError, "checkpoint_seconds must be at least 0"),
+        ({"model": "bfc"}, ValueError, "no model 'bfc'; nearest: bcf"),
         ({"device": "cuda:99"}, ValueError, "device 'cuda:99' cannot be used"),
         ({"device": "gpu"}, ValueError, "device 'gpu' cannot be used"),
         ({"out": "missing/a.neumat"}, FileNotFoundError, "no folder"),

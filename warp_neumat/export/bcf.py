@@ -1,4 +1,4 @@
-"""What `neumat export` writes of a BCf: files that an engine loads without this package (paper [bcf], §5.3).
+"""What `neumat export` writes of a BCf: files that an engine loads without this package (paper [bcf], §5.2).
 
 ====================  ==================================================================================================
 `NAME_features0.dds`  (or `.ktx2`) one BC6H texture per feature layer with its mips: the asset's own blocks, bit for bit
@@ -52,6 +52,9 @@ MANIFEST_VERSION = 1
 """Version of the manifest's layout."""
 
 _WRITERS = {"dds": write_dds, "ktx2": write_ktx2}
+
+CONTAINERS = tuple(_WRITERS)
+"""Names of the containers that textures are written in."""
 
 
 def export_bcf(source, folder, *, format="dds", shaders=tuple(LANGUAGES)) -> list[Path]:

@@ -1,4 +1,4 @@
-"""The BCf decoder as shader source: one description, written out in GLSL, HLSL and WGSL (paper [bcf], §5.3, Eq. 11).
+"""The BCf decoder as shader source: one description, written out in GLSL, HLSL and WGSL (paper [bcf], §5.2, Eq. 11).
 
 The same steps as ``Material.maps``: the T feature textures are sampled by the graphics API's own trilinear sampler at
 an explicit mip level each, their colours are the 3T inputs of a 3T → H → C network with ReLU, and its clamped outputs
@@ -18,7 +18,7 @@ from warp_neumat.export.weight_layout import layout
 
 _ZERO = "float4(0.0, 0.0, 0.0, 0.0)"
 _ONE = "float4(1.0, 1.0, 1.0, 1.0)"
-_COMPONENTS = ("value", "r", "g", "b", "x", "y")
+_COMPONENTS = ("value", "r", "g", "b", "a", "x", "y")
 
 
 @dataclasses.dataclass(frozen=True)

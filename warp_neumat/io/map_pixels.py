@@ -127,8 +127,12 @@ def _channels(source: MapSource, kind, info: ImageInfo) -> tuple[list[int], tupl
         )
     if len(at) == 1:
         return at, ("value",)
-    letters = "rgba" if len(at) <= 4 else None
-    return at, tuple(letters[i] if letters else info.channels[n].lower() for i, n in enumerate(at))
+    if len(at) > 4:
+        raise ValueError(
+            f"{source.file}: map {source.map}: has {len(at)} channels, a map holds at most 4; choose them with "
+            f'overrides={{"{source.map}": {{"channel": [0, 1, 2]}}}}'
+        )
+    return at, tuple("rgba"[: len(at)])
 
 
 def _say(channel) -> str:

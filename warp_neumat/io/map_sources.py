@@ -287,7 +287,7 @@ def _override(found: SourceList, offered: list[MapSource], name: str, fields) ->
     mine = [s for s in found.sources if s.map == name]
     if not mine and not (isinstance(fields, dict) and ("file" in fields or "constant" in fields)):
         known = sorted({s.map for s in found.sources} | {s.map for s in offered})
-        if name not in known and not isinstance(fields, (int, float)):
+        if name not in known and not isinstance(fields, (int, float, list, tuple)):
             raise ValueError(f"{where}: the set has no such map; {nearest(name, known)}, or give its file")
     rest = [s for s in found.sources if s.map != name]
     if fields is None:

@@ -93,7 +93,8 @@ def make_sampler(textures: int, wrap: str, signed: bool, storage: str, lanes: in
         f"const {kind}* const {name} = (const {kind}*)(tables.data + {bcf_storage.OFFSETS[name]});"
         for name, kind in {
             "fac": "int", "region": "unsigned char", "facts": "int", "anchor": "unsigned char",
-            "modes": "unsigned char", "ends": "short",
+            "modes": "unsigned char", "ends": "short", "mode_rows": "unsigned char", "loose": "short",
+            "nibbles": "unsigned long long",
         }.items()
         if storage == "blocks" or (name == "fac" and storage == "unquantised")
     )  # fmt: skip
@@ -101,8 +102,10 @@ def make_sampler(textures: int, wrap: str, signed: bool, storage: str, lanes: in
     plain = filter.scalar_code(textures, lanes, wrap, bcf_texel.scalar_fetch(storage, signed))
     code = plain
     if lanes > 1:
-        wide = filter.vector_code(textures, lanes, wrap, bcf_texel.vector_fetch(storage, signed))
-        code = f"#if defined(__AVX2__) && defined(__F16C__)\n{wide}\n#else\n{plain}\n#endif\n"
+        wide = filter.vector_code(
+            textures, lanes, wrap, bcf_texel.vector_fetch(storage, signed), paired=storage == "half"
+        )
+        code = f"#if defined(__AVX2__) && defined(__F16C__) && defined(__BMI2__)\n{wide}\n#else\n{plain}\n#endif\n"
 
     @wp.func_native(f"{head}\n{code}")
     def sample(
@@ -182,6 +185,53 @@ PROGRAM = wp.constant(10)
 """Words that describe a column."""
 
 
+# A block's samples to lanes; those beyond the last repeat it.
+_TAKE = """
+if (rest >= LANES) {
+    _Pragma("clang loop unroll_count(8)")
+    for (int l = 0; l < LANES; ++l) { u.data[l] = uv.data[2 * l]; v.data[l] = uv.data[2 * l + 1]; }
+} else {
+    for (int l = 0; l < LANES; ++l) {
+        const int at = 2 * (l < rest ? l : rest - 1);
+        u.data[l] = uv.data[at]; v.data[l] = uv.data[at + 1];
+    }
+}
+for (int l = 0; l < LANES; ++l) s.data[l] = lods.data[lod_step ? (l < rest ? l : rest - 1) : 0];
+"""
+
+# A column of a block to every width-th word.
+_PUT = """
+float* out = result.data;
+if (rest >= LANES) {
+    _Pragma("clang loop unroll_count(8)")
+    for (int l = 0; l < LANES; ++l, out += width) *out = x.data[l];
+} else {
+    for (int l = 0; l < rest; ++l, out += width) *out = x.data[l];
+}
+"""
+
+
+@functools.cache
+def _make_moves(lanes: int):
+    """Return the Warp functions ``take(uv, lods, lod_step, rest, u, v, s)`` and ``put(x, rest, width, result)``."""
+
+    @wp.func_native(_TAKE.replace("LANES", str(lanes)))
+    def take(
+        uv: wp.array(dtype=wp.float32),
+        lods: wp.array(dtype=wp.float32),
+        lod_step: int,
+        rest: int,
+        u: wp.array(dtype=wp.float32),
+        v: wp.array(dtype=wp.float32),
+        s: wp.array(dtype=wp.float32),
+    ): ...
+
+    @wp.func_native(_PUT.replace("LANES", str(lanes)))
+    def put(x: wp.array(dtype=wp.float32), rest: int, width: int, result: wp.array(dtype=wp.float32)): ...
+
+    return take, put
+
+
 @functools.cache
 def make_eval_kernel(layout: Layout, lanes: int):
     """Return the kernel behind ``BCf.encoded`` and ``BCf.maps``.
@@ -192,6 +242,7 @@ def make_eval_kernel(layout: Layout, lanes: int):
     holds [n, k].
     """
     maps = make_maps(layout, lanes)
+    take, put = _make_moves(lanes)
     C, L, LANE = layout.channels, lanes, lanes
     # Two names, because a constant that is cast keeps the new type in the rest of the kernel.
     OWN, FIXED = layout.scratch(lanes), (3 + C) * lanes
@@ -223,11 +274,10 @@ def make_eval_kernel(layout: Layout, lanes: int):
         S = wp.array(ptr=own + wp.uint64(2 * L) * FLOAT, shape=(L,), dtype=wp.float32)
         Y = wp.array(ptr=own + wp.uint64(3 * L) * FLOAT, shape=(C * L,), dtype=wp.float32)
         rest = wp.min(count - b * L, L)
-        for l in range(L):
-            at = b * L + wp.min(l, rest - 1)
-            U[l] = uv[2 * at]
-            V[l] = uv[2 * at + 1]
-            S[l] = lods[lod_step * at]
+        begin = wp.uint64(b) * wp.uint64(LANE) * FLOAT
+        A = wp.array(ptr=uv.ptr + begin + begin, shape=(2 * L,), dtype=wp.float32)
+        B = wp.array(ptr=lods.ptr + begin * wp.uint64(lod_step), shape=(L,), dtype=wp.float32)
+        take(A, B, lod_step, rest, U, V, S)
         maps(arguments, U, V, S, rest, own + wp.uint64(FIXED) * FLOAT, Y)
         for j in range(columns):
             kind = program[PROGRAM * j]
@@ -253,9 +303,8 @@ def make_eval_kernel(layout: Layout, lanes: int):
                     z = wp.sqrt(wp.max(1.0 - r, 0.0))
                     U[l] = wp.where(kind == NORMAL, p, z) / wp.max(wp.sqrt(r + z * z), 1.0e-30)
             place = count * program[PROGRAM * j + 3] + program[PROGRAM * j + 5] + width * b * L
-            for l in range(L):
-                if l < rest:
-                    result[place + width * l] = U[l]
+            R = wp.array(ptr=result.ptr + wp.uint64(place) * FLOAT, shape=(L,), dtype=wp.float32)
+            put(U, rest, width, R)
 
     return bcf_eval_kernel
 

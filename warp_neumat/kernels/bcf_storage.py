@@ -1,17 +1,31 @@
 """How BC6H feature textures lie in memory at run time: the choice between bytes and decoding work.
 
-Blocks of 4 × 4 texels lie row by row in every storage, so the number of a texel is 16 · block + 4y + x everywhere:
+Blocks of 4 × 4 texels lie row by row in every storage, mip after mip:
 
 | storage | bytes a block | what a texel costs |
 | --- | --- | --- |
 | ``blocks`` | 16 | the BC6H block itself: its endpoints are gathered from the mode's bit fields, then as below |
 | ``unquantised`` | 64 | two endpoints of 16 bits and their weights: one interpolation, in integers |
-| ``half`` | 128 | float16 R, G, B and a zero: one conversion |
+| ``half`` | 128 | float16 R, G, B: one conversion |
 
 ``unquantised`` knows no modes: two pairs of endpoints in 16 bytes each, words r₀ r₁ g₀ g₁ b₀ b₁ and two unused, then
-two bytes for each texel: at which byte of :func:`weights` its weights lie, and at which of the block its pair, 0 or 16.
-Unsigned endpoints are stored less 32768, so that one signed multiply-add takes a pair of them. A block fills one cache
-line, so at random places this reads no more lines than 16 bytes would.
+two bytes for each texel: which row of :func:`weights` it takes (twice the number), and how many bytes on from 32 bytes
+before these two its pair of endpoints begins. Unsigned endpoints are stored less 32768, so that one signed multiply-add
+takes a pair of them. A block fills one cache line: a footprint of 2 × 2 texels at a random place touches 1.6 of them.
+
+``half`` keeps the right neighbour of a block's last column with it, as float16 without padding: 15 words a row, two
+rows in a cache line, one word of zero before the first and after the second. One 16-byte load takes both texels of a
+footprint's row and never leaves the line, so a footprint touches 1.5 lines.
+
+What each costs on one core (``python -m bench decode``, preset 1k at random places, 4 textures and network; Zen 3 at
+3 GHz, its other hardware thread busy; Msamples/s, best runs):
+
+| lod | ``blocks`` | ``unquantised`` | ``half`` | torch, fp32 |
+| --- | --- | --- | --- | --- |
+TABLE
+
+``blocks`` is bound by decoding: a footprint lies in 1.6 blocks on average, so a sample of 8 footprints decodes 12.5
+blocks of about 8 ns each, 75 vector and scalar instructions; without that step the rest alone runs at 9.5 Msamples/s.
 """
 
 import functools
@@ -92,8 +106,8 @@ def unquantise(blocks: np.ndarray, signed: bool) -> np.ndarray:
     result = np.zeros((len(blocks), 64), np.uint8)
     result[:, :32] = words.view(np.uint8)
     result[one, 16:32] = 0  # not random bits: the same contents give the same bytes
-    result[:, 32::2] = 4 * np.where(one[:, None], 8 + _indices4(high), three)
-    result[:, 33::2] = 16 * np.where(one[:, None], 0, region)
+    result[:, 32::2] = 2 * np.where(one[:, None], 8 + _indices4(high), three)
+    result[:, 33::2] = 16 * np.where(one[:, None], 0, region) + 32 - 2 * np.arange(16)
     return result
 
 
@@ -128,21 +142,123 @@ def _indices3(high, partition) -> np.ndarray:
     return (high[:, None] >> at.astype(np.uint64)).astype(np.int64) & size, region
 
 
+MODE_BYTES = 384
+"""Bytes of a row of :func:`mode_tables`."""
+
+LOOSE = 5
+"""Groups of 4 bits that hold a mode's loose bits, at most."""
+
+
+def _run(bits: dict[int, int]) -> tuple[int, int]:
+    """Return (first position, length) of the longest run of ``bits`` {position: bit} in which both rise by one."""
+    best = (0, 0)
+    for position, bit in bits.items():
+        length = 1
+        while bits.get(position + length) == bit + length:
+            length += 1
+        best = max(best, (position, length), key=lambda run: run[1])
+    return best
+
+
+@functools.cache
+def mode_tables(signed: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Return what decodes the endpoints of any mode by the same few vector instructions.
+
+    Most bits of an endpoint lie side by side: its run. Each pair of endpoints fills a 32-bit lane, so two shuffles of
+    bytes and four shifts by lane bring all runs to the upper ends of their 16-bit words. The loose bits that are left
+    are extracted together, and each group of 4 selects a vector.
+
+    Returns:
+        uint8 (15, 384), a row for each mode and one for the reserved ones: byte shuffles of even and of odd endpoints
+        (32 each), shifts left of both and right of both (8 × uint32 each), mask of the runs, rounding, largest
+        endpoint (16 × int16 each), byte shuffle of what is added to differences (32), codes of weights and of pairs by
+        index (16 each), loose bits in the lower and in the upper half of a block (uint64 each), then int32: number of
+        the former, place of the indices in the upper half, and the two numbers that turn bits 13 … into the row of
+        :func:`index_tables` by and, or;
+        int16 (15, 4, 16, 16): mode, group, its value, endpoints as in :func:`tables`.
+    """
+    facts = tables()["facts"]
+    rows = np.zeros((_NONE + 1, MODE_BYTES), np.uint8)
+    loose = np.zeros((_NONE + 1, LOOSE, 16, 16), np.uint16)
+    for row, (precision, transformed, regions, rounding) in enumerate(facts.tolist()):
+        where: dict[int, dict[int, int]] = {}
+        if row < _NONE:
+            for position, (channel, end, bit) in enumerate(MODES[row].fields, MODES[row].mode_bits):
+                where.setdefault(8 * (end >> 1) + 2 * channel + (end & 1), {})[position] = bit
+        shuffle, shift = np.full((2, 8, 4), 0x80, np.uint8), np.zeros((4, 8), np.uint32)
+        mask, rest = np.zeros(16, np.uint16), []
+        for word, bits in where.items():
+            channel, end = word % 8 // 2, 2 * (word // 8) + word % 2
+            delta = MODES[row].delta[channel] if transformed and end else 99
+            position, length = _run(bits)
+            low = 16 - precision + bits[position]
+            lane, odd = divmod(word, 2)
+            shuffle[odd, lane] = position // 8 + np.arange(4)
+            shift[odd, lane] = 32 - position % 8 - length
+            shift[2 + odd, lane] = 32 - low - length - 16 * odd
+            signs = bits[position] + length == delta
+            mask[word] = (1 << 16 if signs else 1 << low + length) - (1 << low)
+            for p, bit in bits.items():
+                if not position <= p < position + length:
+                    value = (1 << precision) - (1 << bit) if bit == delta - 1 else 1 << bit
+                    rest.append((p, word, value << (16 - precision)))
+        rest.sort()
+        assert len(rest) <= 4 * LOOSE, "a mode has more loose bits than tables"
+        for k, (_, word, value) in enumerate(rest):
+            loose[row, k // 4, np.arange(16) >> k % 4 & 1 == 1, word] ^= value
+        largest = (((1 << (precision - 1)) - 1) if signed else ((1 << precision) - 1)) << (16 - precision)
+        base = np.full((2, 8, 2), 0x80, np.uint8)
+        if transformed:
+            for word in range(6):
+                if word % 2:
+                    base[0, word] = 4 * (word // 2) + np.arange(2)
+                if regions == 2:
+                    base[1, word] = 4 * (word // 2) + np.arange(2)
+        index = np.arange(16)
+        codes = [2 * (index & 7), index >> 3 << 4] if regions == 2 else [2 * (8 + index), 0 * index]
+        halves = [sum(1 << (p - 64 * half) for p, _, _ in rest if p // 64 == half) for half in range(2)]
+        parts = [
+            shuffle, shift, mask, np.full(16, rounding, np.int16), np.full(16, largest, np.uint16), base,
+            np.array(codes, np.uint8), np.array(halves, np.uint64),
+            np.array([halves[0].bit_count(), *((18, 31, 0) if regions == 2 else (1, 0, 32))], np.int32),
+        ]  # fmt: skip
+        rows[row] = np.concatenate([np.ascontiguousarray(p).view(np.uint8).ravel() for p in parts])
+    return rows, loose.view(np.int16)
+
+
+@functools.cache
+def index_tables() -> np.ndarray:
+    """Return how indices lie, uint64 (33, 2) by partition and for one region: the bits of each texel's index, the bits
+    of its region, in 4 bits a texel. Anchors have one bit less."""
+    result = np.zeros((33, 2), np.uint64)
+    for row in range(33):
+        short = (0, int(ANCHOR[row])) if row < 32 else (0,)
+        bits = (3, 1) if row < 32 else (7, 0)
+        result[row, 0] = sum((bits[0] if t in short else 2 * bits[0] + 1) << 4 * t for t in range(16))
+        if row < 32:
+            result[row, 1] = sum((int(PARTITIONS[row]) >> t & 1) << 4 * t + 3 for t in range(16))
+    return result
+
+
 @functools.cache
 def packed_tables(signed: bool) -> np.ndarray:
     """Return every table that the kernels read, in one flat uint8 array; :data:`OFFSETS` says what lies where.
 
-    ``fac`` int16 (24, 2) is :func:`weights`; ``region`` uint8 (32, 16): 16 times the region of a texel; ``facts`` int32
-    (15, 4): whether endpoints are differences (0 or −1), rounding, the largest endpoint, whether there is one region;
-    ``anchor`` (32,) and ``modes`` (32,) uint8; ``ends`` as in :func:`tables`.
+    ``fac`` int16 (24, 4, 2) is :func:`weights`, each four times; ``region`` uint8 (32, 16): 16 times the region of a
+    texel; ``facts`` int32 (15, 4): whether endpoints are differences (0 or −1), rounding, the largest endpoint, whether
+    there is one region; ``anchor`` (32,) and ``modes`` (32,) uint8; ``nibbles`` is :func:`index_tables`; ``mode_rows``
+    and ``loose`` are :func:`mode_tables`; ``ends`` as in :func:`tables`.
     """
     table = tables()
     precision, transformed, regions, rounding = table["facts"].T
     largest = (((1 << (precision - 1)) - 1) if signed else ((1 << precision) - 1)) << (16 - precision)
     region = (16 * (PARTITIONS[:, None] >> np.arange(16, dtype=np.uint16) & 1)).astype(np.uint8)
     facts = np.stack([-transformed, rounding, largest, regions == 1], axis=1).astype(np.int32)
-    parts = {"fac": weights(), "region": region, "facts": facts, "anchor": ANCHOR, "modes": table["mode"]}
-    parts["ends"] = table["ends"]
+    rows, loose = mode_tables(signed)
+    parts = {
+        "fac": weights().repeat(4, axis=0), "region": region, "facts": facts, "anchor": ANCHOR, "modes": table["mode"],
+        "nibbles": index_tables(), "mode_rows": rows, "loose": loose, "ends": table["ends"],
+    }  # fmt: skip
     result = np.zeros(OFFSETS["ends"] + table["ends"].nbytes, np.uint8)
     for name, part in parts.items():
         data = np.ascontiguousarray(part).view(np.uint8).ravel()
@@ -150,7 +266,10 @@ def packed_tables(signed: bool) -> np.ndarray:
     return result
 
 
-OFFSETS = {"fac": 0, "anchor": 96, "modes": 128, "region": 160, "facts": 672, "ends": 928}
+OFFSETS = {
+    "fac": 0, "anchor": 384, "modes": 416, "region": 448, "facts": 960, "nibbles": 1216, "mode_rows": 1792,
+    "loose": 7552, "ends": 45952,
+}  # fmt: skip
 """Byte at which each part of :func:`packed_tables` begins."""
 
 
@@ -160,8 +279,21 @@ def overflows(stored: np.ndarray) -> np.ndarray:
     return (words == -0x8000).any(axis=1)
 
 
-def padded(pixels: np.ndarray) -> np.ndarray:
-    """Return decoded blocks (n, 4, 4, 3) float16 as the storage ``half``, flat uint8."""
-    texels = np.zeros((len(pixels), 16, 4), np.float16)
-    texels[:, :, :3] = pixels.reshape(-1, 16, 3)
-    return texels.view(np.uint8).ravel()
+def paired(pixels: np.ndarray, width: int, height: int, repeat: bool) -> np.ndarray:
+    """Return a decoded mip as the storage ``half``, flat uint8.
+
+    Args:
+        pixels: Decoded blocks (rows, columns, 4, 4, 3) float16.
+        width: Texels of the mip; what blocks hold beyond them is not used.
+        height: As width.
+        repeat: Whether the right neighbour of the last column is the first one, or itself.
+    """
+    rows, columns = pixels.shape[:2]
+    image = pixels.swapaxes(1, 2).reshape(4 * rows, 4 * columns, 3)[:height, :width]
+    beyond = ((0, 4 * rows - height), (0, 4 * columns + 1 - width), (0, 0))
+    image = np.pad(image, beyond, "wrap" if repeat else "edge").reshape(rows, 2, 2, -1)
+    lines = np.zeros((rows, columns, 2, 32), np.float16)
+    for parity in range(2):
+        strips = np.lib.stride_tricks.sliding_window_view(image[:, :, parity], 15, axis=2)[:, :, ::12]
+        lines[..., 1 + 15 * parity : 16 + 15 * parity] = strips.swapaxes(1, 2)
+    return lines.view(np.uint8).ravel()

@@ -5,104 +5,27 @@ A step draws ``batch`` texture coordinates, samples the feature pyramids (trilin
 texels and weights. Nothing of this touches main memory twice: a *patch* of 256 samples goes from coordinates to
 gradients in a scratch that stays in the core's cache.
 
-A patch is a jittered 16 × 16 grid over a square of the texture, as in the paper, but small: it spans
-:data:`SPACING` texels of its mip per sample, so that its fetches meet each other in the cache. Its scale s is one
-number; the patches of a step are stratified in s and, by an additive recurrence, in their place. The host draws
-place, size, scale and weight of each patch (:func:`draw_patches`); the jitter is a hash of (seed, step, sample).
-
-Layouts:
-
-- texels: float32 rows of four (r, g, b, unused), block by block as BC6H stores them: 16 rows a block, the blocks of a
-  mip row by row, the mips of a texture one after another, the textures likewise (:class:`Pyramids`);
-- reference: float16, the mips one after another, each padded by 2 texels on every side as the wrap mode says, so that
-  a bicubic footprint never leaves it; channels padded to a multiple of 8;
-- weights: as :func:`warp_neumat.kernels.mlp.pack` lays them out;
-- gradients: one buffer per *part*. A part is a fixed share of the patches, summed in a fixed order, so that the same
-  seed gives the same bits for the same number of parts.
+The host draws place, size, scale and weight of each patch, and ``patches`` says how everything lies in memory; the
+jitter of the samples is a hash of (key, sample). Weights are packed as :func:`warp_neumat.kernels.mlp.pack` does it.
+Gradients are summed in one buffer per *part*. A part is a fixed share of the patches, summed in a fixed order, so that
+the same seed gives the same bits for the same number of parts.
 
 The CPU code is native: per sample one 128-bit register holds a texel, per layer one 256-bit register holds 8 samples.
+CUDA runs ``bcf_train_scalar``.
 """
 
 import dataclasses
 import functools
-import math
 
-import numpy as np
 import warp as wp
 
 from warp_neumat.kernels import dispatch
+from warp_neumat.kernels.bcf_train_scalar import make_scalar_step_kernel
 from warp_neumat.kernels.mlp import layer_code
-
-PATCH = 256
-"""Samples of a patch: a jittered grid of 16 × 16."""
-
-SPACING = 2.0
-"""Texels of the patch's mip from one sample of its grid to the next."""
+from warp_neumat.kernels.patches import PATCH
 
 CUBIC = -0.75
 """Parameter of the bicubic kernel, the value that torch's ``grid_sample`` has."""
-
-PAD = 2
-"""Texels that each mip of the reference is padded by."""
-
-
-def stored_texels(size: tuple[int, int]) -> int:
-    """Return the texels of the blocks that hold a mip of ``size`` (width, height)."""
-    return 16 * -(-size[0] // 4) * -(-size[1] // 4)
-
-
-@dataclasses.dataclass(frozen=True)
-class Pyramids:
-    """Where everything lies: feature textures and the reference, by mip.
-
-    Attributes:
-        features: For each texture its (width, height) by mip, finest first.
-        reference: (width, height) of the reference by mip.
-        repeat: Whether textures repeat; else they clamp.
-    """
-
-    features: tuple[tuple[tuple[int, int], ...], ...]
-    reference: tuple[tuple[int, int], ...]
-    repeat: bool = True
-
-    @property
-    def texel_count(self) -> int:
-        """Texels of all feature textures, in whole blocks."""
-        return sum(stored_texels(size) for mips in self.features for size in mips)
-
-    @property
-    def biases(self) -> tuple[float, ...]:
-        """The bias b_i of Eq. 11 for each texture."""
-        width, height = self.reference[0]
-        return tuple(math.log2(max(m[0][1] / height, m[0][0] / width)) for m in self.features)
-
-    @property
-    def feature_offsets(self) -> tuple[tuple[int, ...], ...]:
-        """First texel of each mip of each texture."""
-        at, result = 0, []
-        for mips in self.features:
-            row = []
-            for size in mips:
-                row.append(at)
-                at += stored_texels(size)
-            result.append(tuple(row))
-        return tuple(result)
-
-    @property
-    def reference_offsets(self) -> tuple[int, ...]:
-        """First texel of each padded mip of the reference, and the total."""
-        sizes = [(w + 2 * PAD) * (h + 2 * PAD) for w, h in self.reference]
-        return tuple(int(n) for n in np.concatenate([[0], np.cumsum(sizes)]))
-
-    def table(self) -> np.ndarray:
-        """Return the int32 table the kernel reads: (offset, width, height) for 16 mips a texture, then the reference's."""
-        rows = np.zeros((16 * (len(self.features) + 1), 3), np.int32)
-        for t, (mips, offsets) in enumerate(zip(self.features, self.feature_offsets, strict=True)):
-            for m, ((w, h), offset) in enumerate(zip(mips, offsets, strict=True)):
-                rows[16 * t + m] = offset, w, h
-        for m, ((w, h), offset) in enumerate(zip(self.reference, self.reference_offsets[:-1], strict=True)):
-            rows[16 * len(self.features) + m] = offset, w, h
-        return rows
 
 
 @dataclasses.dataclass(frozen=True)
@@ -134,58 +57,6 @@ class StepShape:
         rows = self.inputs + 2 * self.hidden + 2 * self.channels + 12
         transposed = self.inputs * (self.hidden + 1) + self.hidden * (self.channels + 1)
         return PATCH * rows + -(-transposed // 16) * 16 + 64
-
-
-def pad_reference(mips, stride: int, repeat: bool) -> np.ndarray:
-    """Return the reference pyramid as the kernel reads it, flat float16; ``mips`` are (h, w, C) in [0, 1]."""
-    parts = []
-    for mip in mips:
-        h, w, c = mip.shape
-        rows, columns = np.arange(-PAD, h + PAD), np.arange(-PAD, w + PAD)
-        if repeat:
-            rows, columns = rows % h, columns % w
-        else:
-            rows, columns = rows.clip(0, h - 1), columns.clip(0, w - 1)
-        padded = np.zeros((h + 2 * PAD, w + 2 * PAD, stride), np.float16)
-        padded[..., :c] = mip[rows][:, columns]
-        parts.append(padded.reshape(-1))
-    return np.concatenate(parts)
-
-
-def draw_patches(
-    seed: int, step: int, count: int, pyramids: Pyramids, *, decay: float = 0.5, aligned: float = 0.5
-) -> np.ndarray:
-    """Return the patches of one step, (count, 8) float32.
-
-    Columns: scale s, weight in the loss, origin u and v, extent u and v, and where the samples lie on the texel centres
-    of a mip its width and height, else zeros. The share ``aligned`` of the patches does; there the reference is what
-    its texels say, while in between it is an interpolation.
-
-    The density of s falls as 2^(−decay·s), because finer mips have more to learn; the weight makes up for it, so that
-    every mip counts the same in the loss, as in the paper's metric. Half a unit of magnification below s = 0 falls on
-    mip 0 itself, as it does on a screen, and likewise at the coarse end.
-    """
-    draw = np.random.default_rng([seed, 7, step])
-    top = len(pyramids.reference) - 1
-    low, high = -0.5, top + 0.5
-    q = (np.arange(count) + draw.random(count)) / count
-    if decay > 0:
-        edge = 2.0 ** (-decay * (high - low))
-        raw = low - np.log2(1.0 - q * (1.0 - edge)) / decay
-        weight = (1.0 - edge) / ((high - low) * decay * math.log(2.0)) * 2.0 ** (decay * (raw - low))
-    else:
-        raw, weight = low + q * (high - low), np.ones(count)
-    s = raw.clip(0.0, top)
-    # Every so many patches in a row of rising s: strata stay strata.
-    snapped = (np.arange(count) * aligned + draw.random()) % 1.0 < aligned
-    s = np.where(snapped, np.rint(s), s)
-    sizes = np.array(pyramids.reference)
-    centres = np.where(snapped[:, None], sizes[s.astype(int)], 0)
-    extent = (16.0 * SPACING * 2.0 ** s[:, None] / sizes[0]).clip(None, 1.0)
-    # Additive recurrence with the plastic number: any run of it covers the square evenly.
-    place = (draw.random(2) + np.arange(count)[:, None] * (0.7548776662466927, 0.5698402909980532)) % 1.0
-    origin = place if pyramids.repeat else place * (1.0 - extent)
-    return np.concatenate([s[:, None], weight[:, None], origin, extent, centres], axis=1).astype(np.float32)
 
 
 _HEAD = """
@@ -373,7 +244,16 @@ _FEATURES = """
 """
 
 _LOSS = """
-    {
+    if (probe) {
+        // Random signs in place of residuals: the squares of the gradient then average to the diagonal of JᵀJ.
+        const float gain = __builtin_sqrtf(patch[1]);
+        for (int c = 0; c < C; ++c) for (int l = 0; l < L; l += 8) {
+            const U8 lane = {0, 1, 2, 3, 4, 5, 6, 7};
+            const U8 id = (lane + (unsigned)l + (unsigned)(b * L)) * (unsigned)C + (unsigned)c;
+            const I8 bit = (I8)(hash(hash(id ^ 0x5bd1e995u) + (unsigned)key) & 2u) - 1;
+            *(V*)(Y + c * L + l) = gain * __builtin_sqrtf(channel_weight.data[c]) * __builtin_convertvector(bit, V);
+        }
+    } else {
         const float gain = 2.0f * patch[1] / ((float)patch_count * (float)L * (float)C);
         for (int c = 0; c < C; ++c) {
             V sum = Z; const float k = gain * channel_weight.data[c];
@@ -454,6 +334,11 @@ def _cpu_code(shape: StepShape) -> str:
     )
 
 
+def step_kernel(shape: StepShape, lanes: int):
+    """Return the kernel of a training step: a thread is a part for ``lanes`` > 1, a sample for 1 (CUDA)."""
+    return make_step_kernel(shape) if lanes > 1 else make_scalar_step_kernel(shape, CUBIC)
+
+
 @functools.cache
 def make_step_kernel(shape: StepShape):
     """Return the CPU kernel of a training step; one thread is one part."""
@@ -464,6 +349,7 @@ def make_step_kernel(shape: StepShape):
         parts: int,
         key: int,
         repeat: int,
+        probe: int,
         patches: wp.array(dtype=wp.float32),
         patch_count: int,
         table: wp.array(dtype=wp.int32),
@@ -488,6 +374,7 @@ def make_step_kernel(shape: StepShape):
         parts: int,
         key: int,
         repeat: int,
+        probe: int,
         patches: wp.array(dtype=wp.float32),
         patch_count: int,
         table: wp.array(dtype=wp.int32),
@@ -507,8 +394,9 @@ def make_step_kernel(shape: StepShape):
         samples: wp.array(dtype=wp.float32),
     ):
         step_part(
-            first + wp.tid(), parts, key, repeat, patches, patch_count, table, texture_mips, biases, mip_count, texels,
-            texel_count, reference, weights, channel_weight, scratch, texel_gradient, weight_gradient, losses, samples,
+            first + wp.tid(), parts, key, repeat, probe, patches, patch_count, table, texture_mips, biases, mip_count,
+            texels, texel_count, reference, weights, channel_weight, scratch, texel_gradient, weight_gradient, losses,
+            samples,
         )  # fmt: skip
 
     return bcf_step_kernel

@@ -13,7 +13,6 @@ continuous block at the quantised values (straight-through). Shape 32 stands for
 
 import functools
 
-import numpy as np
 import warp as wp
 
 from warp_neumat.kernels import dispatch
@@ -147,7 +146,8 @@ const float scale = mode == 0 ? 1.0f : 0.015625f;
 for (int t = 0; t < 16; ++t) X[t] *= scale;
 float GX[16]; float GE[4][3]; float GW[64];
 for (int i = 0; i < 64; ++i) GW[i] = gradients.data[64ll * block + i];
-for (int q = 1; q < parts; ++q) for (int i = 0; i < 64; ++i) GW[i] += gradients.data[64ll * (block + (long long)q * count) + i];
+for (int q = 1; q < parts; ++q) for (int i = 0; i < 64; ++i)
+    GW[i] += gradients.data[64ll * (block + (long long)q * count) + i];
 for (int t = 0; t < 16; ++t) GX[t] = 0.0f;
 for (int c = 0; c < 3; ++c) {
     const float a0 = E[0][c], a1 = E[2][c], d0 = E[1][c] - a0, d1 = E[3][c] - a1;

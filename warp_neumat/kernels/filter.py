@@ -5,9 +5,10 @@ texels ⌊u W − 1/2⌋ and the next one, which ``repeat`` wraps around and ``c
 coordinate that is not finite is 0, but ±∞ under ``clamp`` are the edges; a level that is not a number is 0.
 
 This file writes C++ for ``wp.func_native``, with a hole for how a texel is fetched; :mod:`~.bcf_texel` fills it. Two
-forms of the same arithmetic: the vector form finds the taps of 8 lanes at a time and then filters lane by lane, with
-two texels in a register, because scalar loads beat the gathers of most cores. The scalar form serves CUDA, one lane a
-thread, and CPUs without AVX2.
+forms of the same arithmetic: the vector form finds the taps of 8 lanes at a time and asks for their cache lines, which
+is what random places wait for, four groups before it filters them lane by lane, with the two texels of a row in a
+register, because scalar loads beat the gathers of most cores. The scalar form serves CUDA, one lane a thread, and CPUs
+without AVX2 and BMI2.
 
 Textures are described by a level table, int32, :data:`RECORD` words each. Blocks of 4 × 4 texels lie row by row, mips
 one after another; texel 4y + x of a block.
@@ -48,8 +49,8 @@ def level_table(sizes, biases, mips, first: int = 0) -> tuple[np.ndarray, int]:
     return table.ravel(), first
 
 
-def vector_code(textures: int, lanes: int, wrap: str, fetch: str) -> str:
-    """Return C++ that filters ``textures`` textures for a block of lanes, on a CPU with AVX2.
+def vector_code(textures: int, lanes: int, wrap: str, fetch: str, *, paired: bool = False) -> str:
+    """Return C++ that filters ``textures`` textures for a block of lanes, on a CPU with AVX2 and BMI2.
 
     It reads ``u``, ``v``, ``lod`` (arrays of ``lanes``), ``count`` (lanes that are wanted), ``lv`` (level table), and
     writes ``x`` [3 textures][lanes]; lanes that are not wanted get anything finite.
@@ -58,11 +59,14 @@ def vector_code(textures: int, lanes: int, wrap: str, fetch: str) -> str:
         textures: Number of textures.
         lanes: Lanes of the block, a multiple of 8.
         wrap: One of :data:`WRAPS`.
-        fetch: C++ that defines how texels are numbered, PER_BLOCK · block + PER_TEXEL · (4y + x); ``place(number)``,
-            the address to ask for ahead of time; and ``fetch(upper left, lower left, upper right, lower right,
-            V& left, V& right)``: four numbers to two columns of texels, the upper one in the lower half.
+        fetch: C++ that defines ``COLUMN(x)`` and ``ROW(y)``, what a texel's place adds to its number beside
+            PER_BLOCK · block; ``place(number)``, the address to ask for ahead of time; ``prepare(taps)``, called once
+            for each group; and ``rows(taps, side, lane, V& upper, V& lower)``: the two texels of each row of a
+            footprint, the left one in the lower half.
+        paired: Whether the storage keeps a texel's right neighbour beside it, so that only the left one is numbered;
+            channels then lie in words 1 to 3 of the left half and 0 to 2 of the right, else in 0 to 2 of both.
     """
-    return "\n".join([_TYPES, fetch, _vector_loop(textures, lanes, wrap)])
+    return "\n".join([_types(paired), fetch, _vector_loop(textures, lanes, wrap, paired)])
 
 
 def scalar_code(textures: int, lanes: int, wrap: str, fetch: str) -> str:
@@ -73,19 +77,30 @@ def scalar_code(textures: int, lanes: int, wrap: str, fetch: str) -> str:
     return "\n".join([fetch, _scalar_loop(textures, lanes, wrap)])
 
 
-_TYPES = """
+def _types(paired: bool) -> str:
+    numbered = 2 if paired else 4
+    return f"""
 typedef float V __attribute__((vector_size(32), aligned(4), may_alias));
 typedef int I __attribute__((vector_size(32), aligned(4), may_alias));
 typedef unsigned int U __attribute__((vector_size(32), aligned(4), may_alias));
-typedef float V4 __attribute__((vector_size(16), aligned(4), may_alias));
+typedef double D4 __attribute__((vector_size(32), aligned(8), may_alias));
 typedef short S8 __attribute__((vector_size(16), aligned(2), may_alias));
 typedef short S16 __attribute__((vector_size(32), aligned(2), may_alias));
 typedef long long L2 __attribute__((vector_size(16), aligned(8), may_alias));
+typedef long long L4 __attribute__((vector_size(32), aligned(8), may_alias));
+typedef unsigned char B8 __attribute__((vector_size(8), aligned(1), may_alias));
+typedef unsigned char B16 __attribute__((vector_size(16), aligned(1), may_alias));
+typedef unsigned char B32 __attribute__((vector_size(32), aligned(1), may_alias));
+typedef char C16 __attribute__((vector_size(16), aligned(1), may_alias));
+typedef char C32 __attribute__((vector_size(32), aligned(1), may_alias));
 typedef _Float16 H8 __attribute__((vector_size(16), aligned(2), may_alias));
 typedef unsigned int u32 __attribute__((aligned(1), may_alias));
 typedef unsigned long long u64 __attribute__((aligned(1), may_alias));
-// Where 8 lanes read one texture: texel numbers of (upper left, lower left, upper right, lower right) in two mips.
-struct alignas(32) Taps { int at[2][4][8]; float fx[2][8], upper[2][8], lower[2][8]; int sides; };
+typedef double f64 __attribute__((aligned(4), may_alias));
+// Hides from the compiler how a vector came about: it would merge two cheap shuffles into one that costs more.
+#define FILTER_KEEP(v) __asm__("" : "+x"(v))
+// Where 8 lanes read one texture: texel numbers in two mips, upper row first, and the weights of (left, right) texels.
+struct alignas(32) Taps {{ int at[2][{numbered}][8]; float w[2][2][16]; int sides; }};
 """
 
 
@@ -98,13 +113,36 @@ _VECTOR_WRAP = {
     " a = a > 1.0f ? 2.0f - a : a;",
 }
 
-_VECTOR_EDGE = {
-    True: "x0 = x0 < 0 ? W - 1 : x0; x1 = x1 < W ? x1 : (I){};  y0 = y0 < 0 ? H - 1 : y0; y1 = y1 < H ? y1 : (I){};",
-    False: "x0 = x0 < 0 ? (I){} : x0; x1 = x1 < W ? x1 : W - 1; y0 = y0 < 0 ? (I){} : y0; y1 = y1 < H ? y1 : H - 1;",
-}
+_AHEAD = 4  # groups between asking for a cache line and reading it
+
+# Holding a place within the texels' centres is the same as holding its texels within the texture.
+_HOLD = "p{0} = p{0} > 0.0f ? p{0} : (V){{}}; p{0} = p{0} < last{0} ? p{0} : last{0};"
 
 
-def _vector_loop(textures: int, lanes: int, wrap: str) -> str:
+def _vector_loop(textures: int, lanes: int, wrap: str, paired: bool) -> str:
+    repeat = wrap == "repeat"
+    hold = "" if repeat else _HOLD.format("x") + _HOLD.format("y")
+    low, high = ("x0 = x0 < 0 ? W - 1 : x0; y0 = y0 < 0 ? H - 1 : y0;", "(I){{}}") if repeat else ("", "{0} - 1")
+    numbers = """
+                const I column = (x0 >> 2) * PER_BLOCK + COLUMN(x0);
+                *(I*)to.at[side][0] = upper + column; *(I*)to.at[side][1] = lower + column;"""
+    if not paired:
+        numbers = f"""
+                I x1 = x0 + 1; x1 = x1 < W ? x1 : {high.format("W")};
+                const I left = (x0 >> 2) * PER_BLOCK + COLUMN(x0), right = (x1 >> 2) * PER_BLOCK + COLUMN(x1);
+                *(I*)to.at[side][0] = upper + left; *(I*)to.at[side][1] = upper + right;
+                *(I*)to.at[side][2] = lower + left; *(I*)to.at[side][3] = lower + right;"""
+    ends = (0, 1) if paired else (0, 3)
+    ask = " ".join(f"__builtin_prefetch(place(to.at[side][{k}][i]));" for k in ends)
+    # The right texels' channels move to where the left ones' are; then words 1, 2, 3 or 0, 1, 2 hold them.
+    turn = "b[k] = __builtin_shufflevector(b[k], b[k], 0, 0, 1, 2, 4, 4, 5, 6);" if paired else ""
+    first = 1 if paired else 0
+    channels = []
+    for c in range(3):
+        word = first + c
+        half, odd = ("low", "high")[word // 2], 2 * (word % 2)
+        order = ", ".join(str(4 * q + odd + e + o) for q in range(2) for o in (0, 8) for e in range(2))
+        channels.append(f"*(V*)(out + {c * lanes} + 8 * g) = __builtin_shufflevector({half}0, {half}1, {order});")
     return f"""
 alignas(32) float uv[2 * {lanes}];
 const int groups = (count + 7) >> 3;
@@ -119,12 +157,12 @@ for (int t = 0; t < {textures}; ++t) {{
     const int w0 = rec[0], h0 = rec[1], top = rec[2] - 1;
     const float bias = *(const float*)(rec + 3);
     float* const out = x.data + 3 * {lanes} * t;
-    // The taps of a group are found, and their lines asked for, while the group before it is filtered.
-    Taps ring[2];
-    for (int turn = 0; turn <= groups; ++turn) {{
+    // The taps of a group are found, and their lines asked for, while groups before it are filtered.
+    Taps ring[{2 * _AHEAD}];
+    for (int turn = 0; turn < groups + {_AHEAD}; ++turn) {{
         if (turn < groups) {{
             const int g = turn;
-            Taps& to = ring[turn & 1];
+            Taps& to = ring[turn & {2 * _AHEAD - 1}];
             V s = *(const V*)(lod.data + 8 * g) + bias;
             s = s > 0.0f ? s : (V){{}};
             s = s < (float)top ? s : (V){{}} + (float)top;
@@ -135,50 +173,71 @@ for (int t = 0; t < {textures}; ++t) {{
                 I k = m + side; k = k < top ? k : (I){{}} + top;
                 I W = ((I){{}} + w0) >> k; W = W > 1 ? W : (I){{}} + 1;
                 I H = ((I){{}} + h0) >> k; H = H > 1 ? H : (I){{}} + 1;
-                const I base = {{rec[4 + k[0]], rec[4 + k[1]], rec[4 + k[2]], rec[4 + k[3]],
-                                 rec[4 + k[4]], rec[4 + k[5]], rec[4 + k[6]], rec[4 + k[7]]}};
-                const V px = *(const V*)(uv + 8 * g) * __builtin_convertvector(W, V) - 0.5f;
-                const V py = *(const V*)(uv + {lanes} + 8 * g) * __builtin_convertvector(H, V) - 0.5f;
+                const I base = k < 8 ? (I)__builtin_ia32_permvarsi256(*(const I*)(rec + 4), k)
+                                     : (I)__builtin_ia32_permvarsi256(*(const I*)(rec + 12), k);
+                const V sizex = __builtin_convertvector(W, V), sizey = __builtin_convertvector(H, V);
+                const V lastx = sizex - 1.0f, lasty = sizey - 1.0f;
+                V px = *(const V*)(uv + 8 * g) * sizex - 0.5f, py = *(const V*)(uv + {lanes} + 8 * g) * sizey - 0.5f;
+                {hold}
                 const V ix = __builtin_elementwise_floor(px), iy = __builtin_elementwise_floor(py);
-                I x0 = __builtin_convertvector(ix, I), y0 = __builtin_convertvector(iy, I), x1 = x0 + 1, y1 = y0 + 1;
-                {_VECTOR_EDGE[wrap == "repeat"]}
+                I x0 = __builtin_convertvector(ix, I), y0 = __builtin_convertvector(iy, I);
+                {low}
+                I y1 = y0 + 1; y1 = y1 < H ? y1 : {high.format("H")};
                 const I pitch = (W + 3) >> 2;
-                x0 = (x0 >> 2) * PER_BLOCK + (x0 & 3) * PER_TEXEL; x1 = (x1 >> 2) * PER_BLOCK + (x1 & 3) * PER_TEXEL;
-                y0 = (base + (y0 >> 2) * pitch) * PER_BLOCK + (y0 & 3) * (4 * PER_TEXEL);
-                y1 = (base + (y1 >> 2) * pitch) * PER_BLOCK + (y1 & 3) * (4 * PER_TEXEL);
-                *(I*)to.at[side][0] = y0 + x0; *(I*)to.at[side][1] = y1 + x0;
-                *(I*)to.at[side][2] = y0 + x1; *(I*)to.at[side][3] = y1 + x1;
-                const V share = side ? part : 1.0f - part, fy = py - iy;
-                *(V*)to.fx[side] = px - ix; *(V*)to.upper[side] = (1.0f - fy) * share;
-                *(V*)to.lower[side] = fy * share;
-                for (int i = 0; i < 8; ++i) {{
-                    __builtin_prefetch(place(to.at[side][0][i])); __builtin_prefetch(place(to.at[side][3][i]));
-                }}
+                const I upper = (base + (y0 >> 2) * pitch) * PER_BLOCK + ROW(y0);
+                const I lower = (base + (y1 >> 2) * pitch) * PER_BLOCK + ROW(y1);
+                {numbers}
+                const V fx = px - ix, share = side ? part : 1.0f - part, below = (py - iy) * share;
+                const V above = share - below, above1 = fx * above, below1 = fx * below;
+                const V above0 = above - above1, below0 = below - below1;
+                float* const w = to.w[side][0];
+                *(V*)w = __builtin_shufflevector(above0, above1, 0, 8, 1, 9, 4, 12, 5, 13);
+                *(V*)(w + 8) = __builtin_shufflevector(above0, above1, 2, 10, 3, 11, 6, 14, 7, 15);
+                *(V*)(w + 16) = __builtin_shufflevector(below0, below1, 0, 8, 1, 9, 4, 12, 5, 13);
+                *(V*)(w + 24) = __builtin_shufflevector(below0, below1, 2, 10, 3, 11, 6, 14, 7, 15);
+                __asm__ volatile("" ::: "memory");
+                _Pragma("clang loop unroll(full)")
+                for (int i = 0; i < 8; ++i) {{ {ask} }}
             }}
         }}
-        if (turn == 0) continue;
-        const int g = turn - 1;
-        const Taps& from = ring[g & 1];
-        alignas(32) float texel[8][4];
+        if (turn < {_AHEAD}) continue;
+        const int g = turn - {_AHEAD};
+        const Taps& from = ring[g & {2 * _AHEAD - 1}];
+        prepare(from);
+        V sum[8];
+        _Pragma("clang loop unroll(full)")
         for (int i = 0; i < 8; ++i) {{
-            V4 sum = {{}};
-            for (int side = 0; side < from.sides; ++side) {{
-                V left, right;
-                fetch(from.at[side][0][i], from.at[side][1][i], from.at[side][2][i], from.at[side][3][i], left, right);
-                const V both = left + (right - left) * from.fx[side][i];
-                sum += __builtin_shufflevector(both, both, 0, 1, 2, 3) * from.upper[side][i];
-                sum += __builtin_shufflevector(both, both, 4, 5, 6, 7) * from.lower[side][i];
-            }}
-            *(V4*)texel[2 * (i & 3) + (i >> 2)] = sum;
+            const int spot = (i & 1) | (i & 2) << 1 | (i & 4) >> 1;
+            auto add = [&](int side, V into) __attribute__((always_inline)) {{
+                V upper, lower;
+                rows(from, side, i, upper, lower);
+                auto weight = [&](int row) __attribute__((always_inline)) {{
+                    const double two = *(const f64*)(from.w[side][row] + 2 * spot);
+                    V w = (V)(D4){{two, two, two, two}};
+                    FILTER_KEEP(w);
+                    return __builtin_shufflevector(w, w, 0, 0, 0, 0, 5, 5, 5, 5);
+                }};
+                into += upper * weight(0);
+                into += lower * weight(1);
+                return into;
+            }};
+            sum[i] = add(0, (V){{}});
+            if (from.sides == 2) sum[i] = add(1, sum[i]);
         }}
-        const V a = *(const V*)texel[0], b = *(const V*)texel[2], c = *(const V*)texel[4], d = *(const V*)texel[6];
-        const V ab = __builtin_shufflevector(a, b, 0, 8, 1, 9, 4, 12, 5, 13);
-        const V cd = __builtin_shufflevector(c, d, 0, 8, 1, 9, 4, 12, 5, 13);
-        const V ab2 = __builtin_shufflevector(a, b, 2, 10, 3, 11, 6, 14, 7, 15);
-        const V cd2 = __builtin_shufflevector(c, d, 2, 10, 3, 11, 6, 14, 7, 15);
-        *(V*)(out + 8 * g) = __builtin_shufflevector(ab, cd, 0, 1, 8, 9, 4, 5, 12, 13);
-        *(V*)(out + {lanes} + 8 * g) = __builtin_shufflevector(ab, cd, 2, 3, 10, 11, 6, 7, 14, 15);
-        *(V*)(out + 2 * {lanes} + 8 * g) = __builtin_shufflevector(ab2, cd2, 0, 1, 8, 9, 4, 5, 12, 13);
+        V a[4], b[4];
+        _Pragma("clang loop unroll(full)")
+        for (int k = 0; k < 4; ++k) {{
+            a[k] = __builtin_shufflevector(sum[k], sum[k + 4], 0, 1, 2, 3, 8, 9, 10, 11);
+            b[k] = __builtin_shufflevector(sum[k], sum[k + 4], 4, 5, 6, 7, 12, 13, 14, 15);
+            FILTER_KEEP(b[k]);
+            {turn}
+            a[k] += b[k];
+        }}
+        const V low0 = __builtin_shufflevector(a[0], a[1], 0, 8, 1, 9, 4, 12, 5, 13);
+        const V low1 = __builtin_shufflevector(a[2], a[3], 0, 8, 1, 9, 4, 12, 5, 13);
+        const V high0 = __builtin_shufflevector(a[0], a[1], 2, 10, 3, 11, 6, 14, 7, 15);
+        const V high1 = __builtin_shufflevector(a[2], a[3], 2, 10, 3, 11, 6, 14, 7, 15);
+        {" ".join(channels)}
     }}
 }}
 """

@@ -6,7 +6,7 @@ scale of Eq. 11. Texels come from one of two sets of parameters: *free* texels (
 
 Differs from the paper: features have mips down to 1×1 (``smallest_mip``; below 4×4 the paper's network sees the same
 features for every scale and cannot tell the mips apart); free texels are kept within ``feature_range``, a few octaves
-that BC6H resolves well; blocks may take any of the 14 modes, and are trained through the quantisation of theirs.
+that BC6H resolves well; blocks may take any of the 14 modes.
 
 :func:`reference_loss` is the plain torch version of one training step, which the kernels are tested against.
 """
@@ -26,13 +26,14 @@ from warp_neumat.io.mipmaps import mip_sizes
 from warp_neumat.kernels.bc6h_encode import bc6h_fit
 from warp_neumat.kernels.bc6h_encode_pack import bc6h_pack, bc6h_unpack
 from warp_neumat.kernels.bc6h_tables import ANCHOR, MODES, PARTITIONS
-from warp_neumat.kernels.bcf_train import Pyramids, StepShape, stored_texels
+from warp_neumat.kernels.bcf_train import StepShape
 from warp_neumat.kernels.block_texture import ONE_REGION
+from warp_neumat.kernels.patches import Pyramids, stored_texels
 
 DATA = "maps"
 VERSION = 1
 
-DEFAULT_STEPS = 12000
+DEFAULT_STEPS = 8000
 """Optimiser steps of a fit where the caller names none."""
 
 PRESETS = {
@@ -71,12 +72,13 @@ class BCfConfig:
     """Whether partitions come from free features that are trained first (paper §5.1); else they are drawn at random."""
     modes: str = "all"
     """``all``: every block takes the BC6H mode that fits it best; ``single``: mode 10, the paper's."""
-    qat: bool = True
-    """Train through the quantisation of the blocks (straight-through); else quantise once at the end, as the paper."""
-    rounds: int = 4
-    """How often modes are chosen anew in that phase."""
-    repartition: bool = True
-    """Whether partitions are chosen anew with the modes, for texels that were set free for a moment."""
+    quantisation: str = "sequential"
+    """How continuous blocks become real ones: ``sequential``, texture by texture, the rest making up for it;
+    ``straight-through``, all at once and trained on through the rounding; ``once``, at the end (paper)."""
+    repartition: int = 0
+    """How often texels are set free for a moment and partitions chosen anew while blocks are trained."""
+    sensitivity: bool = True
+    """Whether encoding weighs each texel's error by how much the outputs care for it."""
     channel_weights: str = "uniform"
     """Weights of the channels in the loss: ``uniform`` (paper), or ``variance``: flat channels count more."""
     mip_decay: float = 0.5
@@ -113,7 +115,11 @@ def _check(config: BCfConfig) -> None:
         "wrap": (config.wrap in ("repeat", "clamp", "mirror"), "must be repeat, clamp or mirror"),
         "modes": (config.modes in ("all", "single"), "must be all or single"),
         "channel_weights": (config.channel_weights in ("uniform", "variance"), "must be uniform or variance"),
-        "rounds": (1 <= config.rounds <= 64, "must lie in 1 … 64"),
+        "quantisation": (
+            config.quantisation in ("sequential", "straight-through", "once"),
+            "must be sequential, straight-through or once",
+        ),
+        "repartition": (0 <= config.repartition <= 16, "must lie in 0 … 16"),
         "mip_decay": (0.0 <= config.mip_decay <= 2.0, "must lie in 0 … 2"),
         "aligned": (0.0 <= config.aligned <= 1.0, "must lie in 0 … 1"),
     }
@@ -231,22 +237,39 @@ class BCf(nn.Module):
         self.shapes.copy_(torch.randint(0, 32, self.shapes.shape, generator=generator))
         self.modes.zero_()
 
-    def encode(self, modes: str) -> None:
-        """Replace the blocks by the best BC6H encoding of the texels, in linear values, ready to train on."""
-        targets = self.texels.view(-1, 16, 4)[:, :, :3].contiguous().numpy()
-        blocks, _ = bc6h_fit(targets, signed=self.config.signed, modes=modes, linear=True)
-        self.load_blocks(blocks)
+    def encode(self, modes: str, sensitivity: torch.Tensor | None = None, part: tuple[int, int] | None = None) -> None:
+        """Replace the blocks by the best BC6H encoding of the texels, in linear values, ready to train on.
 
-    def load_blocks(self, blocks: np.ndarray) -> None:
-        """Take over BC6H blocks (B, 16) uint8 as parameters, quantised to their modes."""
-        parts = bc6h_unpack(blocks, self.config.signed)
+        Args:
+            modes: ``all`` or ``single``.
+            sensitivity: (P, 4) weights of the squared error of each texel.
+            part: First and last + 1 of the blocks to encode; default: all.
+        """
+        first, last = part or (0, len(self.shapes))
+        targets = self.texels.view(-1, 16, 4)[first:last, :, :3].contiguous().cpu().numpy()
+        if sensitivity is not None:
+            rows = sensitivity.view(-1, 16, 4)[first:last, :, :3]
+            # Relative to the block, and bounded: texels that no sample hits still have to land somewhere.
+            rows = rows / rows.mean(dim=(1, 2), keepdim=True).clamp(min=1e-30) + 0.01
+            sensitivity = rows.contiguous().cpu().numpy()
+        blocks, _ = bc6h_fit(targets, weights=sensitivity, signed=self.config.signed, modes=modes, linear=True)
+        self.load_blocks(blocks, first)
+
+    def block_range(self, texture: int) -> tuple[int, int]:
+        """Return the first and last + 1 of the blocks of a texture."""
+        counts = [sum(stored_texels(size) // 16 for size in mips) for mips in self.config.mips]
+        return sum(counts[:texture]), sum(counts[: texture + 1])
+
+    def load_blocks(self, blocks: np.ndarray, first: int = 0) -> None:
+        """Take over BC6H blocks (n, 16) uint8 as parameters from block ``first`` on, quantised to their modes."""
+        parts, at = bc6h_unpack(blocks, self.config.signed), slice(first, first + len(blocks))
         one = np.array([False, *(m.regions == 1 for m in MODES)])[parts.mode]
-        self.shapes.copy_(torch.from_numpy(np.where(one, ONE_REGION, parts.partition).astype(np.int32)))
-        self.modes.copy_(torch.from_numpy(parts.mode.astype(np.int32)))
+        self.shapes[at] = torch.from_numpy(np.where(one, ONE_REGION, parts.partition).astype(np.int32))
+        self.modes[at] = torch.from_numpy(parts.mode.astype(np.int32))
         full = 32768.0 if self.config.signed else 65536.0
-        self.endpoints.copy_(torch.from_numpy((parts.endpoints / full).astype(np.float32)))
+        self.endpoints[at] = torch.from_numpy((parts.endpoints / full).astype(np.float32))
         steps = np.where(one, 15, 7)[:, None]
-        self.positions.copy_(torch.from_numpy((parts.indices / steps).astype(np.float32)))
+        self.positions[at] = torch.from_numpy((parts.indices / steps).astype(np.float32))
 
     def blocks(self) -> np.ndarray:
         """Return the BC6H blocks (B, 16) uint8 that the quantised parameters stand for, bit for bit."""
@@ -269,14 +292,16 @@ class BCf(nn.Module):
 
     def quantised(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return (codes (B, 4, 3), indices (B, 16), shapes (B,), modes (B,)) by the arithmetic of the kernel."""
-        shapes, modes = self.shapes.numpy(), self.modes.numpy()
+        shapes, modes = self.shapes.cpu().numpy(), self.modes.cpu().numpy()
         if not (modes > 0).all():
             raise ValueError("the blocks are continuous; encode them first")
-        signed, e = self.config.signed, self.endpoints.numpy()
+        signed, e = self.config.signed, self.endpoints.cpu().numpy()
         precision = np.array([0, *(m.precision for m in MODES)])[modes][:, None, None]
         one = shapes == ONE_REGION
         steps = np.where(one, 15, 7)[:, None]
-        indices = (self.positions.numpy().clip(0, 1) * steps.astype(np.float32) + np.float32(0.5)).astype(np.int32)
+        indices = (self.positions.cpu().numpy().clip(0, 1) * steps.astype(np.float32) + np.float32(0.5)).astype(
+            np.int32
+        )
         most = (1 << (precision - signed)) - 1
         scaled = e * (1 << (precision - signed)).astype(np.float32)
         near = np.where(precision > 14, scaled + np.where(scaled < 0, np.float32(-0.5), np.float32(0.5)), scaled)
@@ -300,7 +325,7 @@ class BCf(nn.Module):
                 count = stored_texels(size) // 16
                 tensors[f"texture{t}.mip{m}"] = blocks[at : at + count].reshape(-(-size[1] // 4), -(-size[0] // 4), 16)
                 at += count
-        w0, b0, w1, b1 = (p.detach().numpy().astype(np.float16) for p in self.layers())
+        w0, b0, w1, b1 = (p.detach().cpu().numpy().astype(np.float16) for p in self.layers())
         tensors |= {"weight0": w0.T.copy(), "bias0": b0.copy(), "weight1": w1.T.copy(), "bias1": b1.copy()}
         sizes = [{"width": mips[0][0], "height": mips[0][1], "mips": len(mips)} for mips in config.mips]
         header = {
@@ -393,7 +418,7 @@ def reference_loss(model: BCf, texels, net, reference, patches, uv, channel_weig
         texels: (P, 3 or 4), the rows the kernels sample.
         net: Packed weights.
         reference: Pictures (1, C, h, w) by mip.
-        patches: (n, 8), as :func:`warp_neumat.kernels.bcf_train.draw_patches` returns them.
+        patches: (n, 8), as :func:`warp_neumat.kernels.patches.draw_patches` returns them.
         uv: (n, 256, 2) texture coordinates.
         channel_weight: (C,).
     """
@@ -418,4 +443,3 @@ def reference_loss(model: BCf, texels, net, reference, patches, uv, channel_weig
 def build(config: BCfConfig, seed: int, mean: np.ndarray) -> BCf:
     """Return a model of ``config`` whose draws come from ``seed``; ``mean`` (C,) is the reference's."""
     return BCf(config, mean, seed)
-

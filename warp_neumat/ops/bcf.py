@@ -3,9 +3,11 @@
 import torch
 import warp as wp
 
-from warp_neumat.kernels.bcf_train import Pyramids, StepShape, make_step_kernel
-from warp_neumat.kernels.dispatch import Job
+from warp_neumat.kernels.bcf_train import StepShape, step_kernel
+from warp_neumat.kernels.dispatch import Job, lanes
+from warp_neumat.kernels.patches import PATCH, Pyramids
 from warp_neumat.ops.block_texture import flat
+from warp_neumat.ops.stream import torch_stream
 
 
 class Step:
@@ -16,7 +18,7 @@ class Step:
         shape: Sizes of the network.
         texels: (P, 4) float32, read at each run.
         net: Packed weights, read at each run.
-        reference: From :func:`warp_neumat.kernels.bcf_train.pad_reference`, float16, flat.
+        reference: From :func:`warp_neumat.kernels.patches.pad_reference`, float16, flat.
         patch_count: Patches of 256 samples a step.
         parts: Buffers that gradients are summed in, one thread each. The same number gives the same bits.
         channel_weight: (C,) float32, factors of the channels' squared errors; default: ones.
@@ -28,7 +30,9 @@ class Step:
         weight_gradient: (parts, weights).
     """
 
-    def __init__(self, pyramids: Pyramids, shape: StepShape, texels, net, reference, patch_count, parts, channel_weight=None):
+    def __init__(
+        self, pyramids: Pyramids, shape: StepShape, texels, net, reference, patch_count, parts, channel_weight=None
+    ):
         wp.init()
         device = texels.device
         if texels.shape != (pyramids.texel_count, 4) or net.shape != (shape.weights,):
@@ -47,27 +51,38 @@ class Step:
         self.weight_gradient = torch.zeros(parts, shape.weights, device=device)
         self.samples = torch.zeros(patch_count, 256, 2, device=device)
         scratch = torch.zeros(parts * shape.scratch, device=device)
+        self._device, wide = wp.device_from_torch(device), lanes(wp.device_from_torch(device)) > 1
+        if not wide and parts != 1:
+            raise ValueError(f"parts must be 1 on {device}, which sums gradients by atomic additions, got {parts}")
         self._job = Job(
-            make_step_kernel(shape),
-            parts,
+            step_kernel(shape, 256 if wide else 1),
+            parts if wide else patch_count * PATCH,
             inputs=[
-                parts, 0, int(pyramids.repeat), flat(self.patches), patch_count, flat(table), flat(mips), flat(biases),
-                len(pyramids.reference), flat(texels), pyramids.texel_count, flat(reference), flat(net),
+                parts, 0, int(pyramids.repeat), 0, flat(self.patches), patch_count, flat(table), flat(mips),
+                flat(biases), len(pyramids.reference), flat(texels), pyramids.texel_count, flat(reference), flat(net),
                 flat(channel_weight.contiguous()), flat(scratch),
             ],
             outputs=[flat(t) for t in (self.texel_gradient, self.weight_gradient, self.losses, self.samples)],
-            device=wp.device_from_torch(device),
+            device=self._device,
             grain=1,
         )  # fmt: skip
         self._keep = (table, mips, biases, scratch, reference, texels, net, channel_weight)
 
-    def run(self, patches, key: int) -> None:
-        """Fill losses and gradients for these patches; ``key`` decides the jitter of the samples."""
+    def run(self, patches, key: int, *, probe: bool = False) -> None:
+        """Fill losses and gradients for these patches; ``key`` decides the jitter of the samples.
+
+        With ``probe`` the residuals are random signs: the squares of the texels' gradient average, over keys, to the
+        diagonal of JᵀJ, how much the outputs care for each texel. Losses are left as they were.
+        """
         self.patches.copy_(patches)
         self.texel_gradient.zero_()
         self.weight_gradient.zero_()
+        if not self._device.is_cpu and not probe:
+            self.losses.zero_()
         self._job.set(1, key & 0x7FFFFFFF)
-        self._job.run()
+        self._job.set(3, int(probe))
+        with torch_stream(self._device):
+            self._job.run()
 
 
 @torch.library.custom_op("neumat::bcf_loss", mutates_args=())
@@ -128,14 +143,25 @@ def _backward(ctx, gradient, *_):
 _bcf_loss.register_autograd(_backward, setup_context=_keep)
 
 
-def bcf_loss(texels, net, reference, patches, pyramids: Pyramids, *, channels: int, hidden: int = 16, key: int = 0, parts: int = 1):
+def bcf_loss(
+    texels,
+    net,
+    reference,
+    patches,
+    pyramids: Pyramids,
+    *,
+    channels: int,
+    hidden: int = 16,
+    key: int = 0,
+    parts: int = 1,
+):
     """Return the loss of one training step and its samples (n, 256, 2); differentiable in ``texels`` and ``net``.
 
     Args:
         texels: (P, 4) float32, rows of the feature pyramids, block by block.
         net: Packed weights float32.
-        reference: Flat float16, from :func:`warp_neumat.kernels.bcf_train.pad_reference`.
-        patches: (n, 8) float32, from :func:`warp_neumat.kernels.bcf_train.draw_patches`.
+        reference: Flat float16, from :func:`warp_neumat.kernels.patches.pad_reference`.
+        patches: (n, 8) float32, from :func:`warp_neumat.kernels.patches.draw_patches`.
         pyramids: Sizes of features and reference.
         channels: C.
         hidden: Units of the hidden layer.

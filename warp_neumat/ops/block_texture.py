@@ -5,6 +5,7 @@ import warp as wp
 
 from warp_neumat.kernels.block_texture import make_block_kernels
 from warp_neumat.kernels.dispatch import Job, launch
+from warp_neumat.ops.stream import torch_stream
 
 GRAIN = 64
 """Blocks worth a chunk of their own."""
@@ -55,7 +56,8 @@ def block_decode(
     tensors = [t.contiguous() for t in (endpoints, positions, shapes, modes)]
     inputs = [int(signed), *(flat(t) for t in tensors)]
     device = wp.device_from_torch(endpoints.device)
-    launch(make_block_kernels()[0], count, inputs, [flat(texels)], device=device, grain=GRAIN)
+    with torch_stream(device):
+        launch(make_block_kernels()[0], count, inputs, [flat(texels)], device=device, grain=GRAIN)
     return texels
 
 
@@ -80,7 +82,8 @@ def block_decode_adjoint(
     out = torch.empty_like(tensors[0]), torch.empty_like(tensors[1])
     inputs = [count, 1, int(signed), *(flat(t) for t in tensors)]
     device = wp.device_from_torch(endpoints.device)
-    launch(make_block_kernels()[1], count, inputs, [flat(t) for t in out], device=device, grain=GRAIN)
+    with torch_stream(device):
+        launch(make_block_kernels()[1], count, inputs, [flat(t) for t in out], device=device, grain=GRAIN)
     return out
 
 
@@ -120,7 +123,7 @@ class BlockJobs:
         self.endpoint_gradient, self.position_gradient = torch.zeros_like(endpoints), torch.zeros_like(positions)
         blocks = [flat(t) for t in (endpoints, positions, shapes, modes)]
         decode, adjoint = make_block_kernels()
-        device = wp.device_from_torch(endpoints.device)
+        self._device = device = wp.device_from_torch(endpoints.device)
         self._decode = Job(decode, count, [int(signed), *blocks], [flat(texels)], device=device, grain=GRAIN)
         inputs = [count, gradients.shape[0], int(signed), *blocks, flat(gradients)]
         outputs = [flat(self.endpoint_gradient), flat(self.position_gradient)]
@@ -128,8 +131,10 @@ class BlockJobs:
 
     def decode(self) -> None:
         """Write the texels of the blocks."""
-        self._decode.run()
+        with torch_stream(self._device):
+            self._decode.run()
 
     def adjoint(self) -> None:
         """Write the gradients of endpoints and positions."""
-        self._adjoint.run()
+        with torch_stream(self._device):
+            self._adjoint.run()

@@ -27,6 +27,8 @@ def decode_size(material, size=None, lod: float | None = None) -> tuple[tuple[in
     The level defaults to that which fits the size, the size to that of the level (rounded down to a whole mip), both to
     the finest mip.
     """
+    if not hasattr(material, "maps"):
+        raise ValueError(f"{material.name}: a material of kind {material.kind!r} has no maps to decode")
     config = material.header["config"]
     full = config["width"], config["height"]
     if size is not None:
@@ -87,6 +89,8 @@ def write_maps(folder, material, size=None, lod: float | None = None, *, bits: i
     written = []
     for name, picture in pictures.items():
         encoding, bounded = _facts(material, name)
+        if picture.shape[2] == 2:  # no picture format has two colours: blue is 0
+            picture = np.concatenate([picture, np.zeros_like(picture[..., :1])], axis=2)
         if encoding == "normal":
             path = folder / f"{name}_gl.png"
             _write_png(path, 0.5 + 0.5 * picture, bits, srgb=False)
@@ -121,6 +125,7 @@ def _write_png(path: Path, picture: np.ndarray, bits: int, *, srgb: bool) -> Non
     levels, dtype = (255, np.uint8) if bits == 8 else (65535, np.uint16)
     stored = np.rint(np.clip(picture, 0, 1) * np.float32(levels)).astype(dtype)
     buffer = oiio.ImageBuf(np.ascontiguousarray(stored))
+    buffer.specmod().attribute("oiio:UnassociatedAlpha", 1)  # a fourth channel is a value like the others
     if srgb:
         buffer.specmod().attribute("oiio:ColorSpace", "sRGB")
     with replacing(path) as temporary:

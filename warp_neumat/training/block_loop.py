@@ -1,12 +1,13 @@
-"""Training of a BCf material: warm-up, blocks, quantised blocks, network (paper [bcf], §5–6 and past it).
+"""Training of a BCf material: warm-up, blocks, quantisation, network (paper [bcf], §5–6 and past it).
 
 1. ``free``: texels move freely, the network with them (the paper's warm-up).
-2. ``blocks``: texels are encoded, and the endpoints and positions of the blocks are trained as continuous values.
-3. ``quantised``: modes are chosen, and training goes on through the quantisation of each block's mode
-   (straight-through), so that the features are at every step those of real BC6H blocks. In rounds: modes are chosen
-   anew from the continuous values, partitions from texels that were set free for a moment (``released``).
-4. ``network``: the blocks are packed, bit for bit what was trained, and frozen; the network is tuned to them, with
-   its weights rounded to float16, as they are stored.
+2. ``blocks``: texels are encoded, which chooses partitions, and the endpoints and positions of the blocks are trained
+   as continuous values. With ``repartition`` they are set free (``released``) and encoded anew now and then.
+3. ``quantised``: one texture after another is encoded as real BC6H blocks and frozen, and everything that is still
+   continuous is trained on to make up for it. The paper quantises all at once; rounding errors of one texture are then
+   nobody's to correct. Every encoding weighs a texel by how much the outputs care for it.
+4. ``network``: the blocks are packed, bit for bit what was trained, and the network is tuned to them, with its weights
+   rounded to float16, as they are stored.
 
 Every random draw is a function of (seed, step): the same seed gives the same file on one machine with the same number
 of threads, and a resumed run goes on exactly as if it had never stopped.
@@ -24,7 +25,7 @@ import torch
 
 from warp_neumat.kernels import dispatch
 from warp_neumat.kernels.bc6h import bc6h_decode
-from warp_neumat.kernels.bcf_train import PATCH, draw_patches, pad_reference
+from warp_neumat.kernels.patches import PATCH, draw_patches, pad_reference
 from warp_neumat.models.bcf import BCf
 from warp_neumat.ops.bcf import Step
 from warp_neumat.ops.block_texture import BlockJobs
@@ -32,6 +33,10 @@ from warp_neumat.training import checkpoint
 
 MOST_PARTS = 8
 """Gradient buffers at most: each costs the memory of the texels, and their sum the time to read them."""
+
+
+PROBES = 32
+"""Random probes that an estimate of the texels' sensitivity averages."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,34 +47,46 @@ class Stage:
     share: float
     """Of all steps."""
     rates: dict
-    """Learning rate at begin and end by buffer of the model."""
+    """Learning rate at begin and end, by buffer of the model."""
     begin: str = ""
-    """What happens first: ``encode``, ``quantise``, ``release``, ``freeze`` or nothing."""
+    """What happens first: ``encode``, ``random``, ``quantise``, ``freeze`` or nothing."""
+    texture: int | None = None
+    """Which texture is quantised; None for all."""
 
 
 def stages(config) -> list[Stage]:
     """Return the stages of a fit; their shares sum to 1."""
-    free, blocks, quantised, network = 0.30, 0.25, 0.40, 0.05
+    free, blocks, quantised, network = 0.2, 0.35, 0.4, 0.05
     result = []
     if config.warmup:
         result.append(Stage("free", free, {"texels": (2e-2, 2e-3), "net": (5e-3, 1e-3)}))
     else:
         blocks += free
-    if not config.qat:
+    if config.quantisation == "once":
         blocks, quantised = blocks + quantised, 0.0
-    begin = "encode" if config.warmup else "random"
-    rates = {"endpoints": (3e-3, 3e-4), "positions": (3e-2, 3e-3), "net": (2e-3, 3e-4)}
-    result.append(Stage("blocks", blocks, rates, begin))
-    for number in range(config.rounds if quantised else 0):
-        fall = [0.1 ** (n / config.rounds) for n in (number, number + 1)]
-        share = quantised / config.rounds
-        if config.repartition and number:
-            released = {"texels": (2e-3 * fall[0], 2e-3 * fall[0]), "net": (3e-4, 3e-4)}
-            result.append(Stage("released", 0.2 * share, released, "release"))
-            share *= 0.8
-        rates = {"endpoints": [1e-3 * f for f in fall], "positions": [1e-2 * f for f in fall]}
-        rates["net"] = [1e-3 * f for f in fall]
-        result.append(Stage("quantised", share, rates, "quantise"))
+
+    parts = config.repartition + 1
+    for part in range(parts):
+        first, last = 0.1 ** (part / parts), 0.1 ** ((part + 1) / parts)
+        share, begin = blocks / parts, "encode" if config.warmup else "random"
+        if part:
+            released = {"texels": (3e-3 * first, 1e-3 * first), "net": (1e-3, 1e-3)}
+            result.append(Stage("released", 0.25 * share, released))
+            share, begin = 0.75 * share, "encode"
+        highest = {"endpoints": 3e-3, "positions": 3e-2, "net": 2e-3}
+        rates = {name: (rate * first, rate * last) for name, rate in highest.items()}
+        result.append(Stage("blocks", share, rates, begin))
+
+    if config.quantisation == "straight-through":
+        rates = {"endpoints": (3e-5, 3e-6), "positions": (1e-3, 1e-4), "net": (1e-3, 1e-4)}
+        result.append(Stage("quantised", quantised, rates, "quantise"))
+    if config.quantisation == "sequential":
+        count = len(config.features)
+        for texture in range(count):
+            rates = {"endpoints": (1e-3, 1e-4), "positions": (1e-2, 1e-3), "net": (1e-3, 3e-4)}
+            if texture == count - 1:  # nothing is continuous any more
+                rates = {"net": (1e-3, 3e-4)}
+            result.append(Stage("quantised", quantised / count, rates, "quantise", texture))
     result.append(Stage("network", network, {"net": (5e-4, 2e-5)}, "freeze"))
     return result
 
@@ -97,7 +114,7 @@ class BlockTrainer:
         self.last_loss = math.nan
         self._stage = self._step = self._count = 0
         self._elapsed = {"total": 0.0, "stage": 0.0}
-        self._pending = None
+        self._pending = self._frozen = None
         pyramids, shape = self.config.pyramids, self.config.shape
         device = model.texels.device
         self._parts = min(MOST_PARTS, dispatch.worker_count()) if device.type == "cpu" else 1
@@ -105,9 +122,7 @@ class BlockTrainer:
         self.channel_weight = torch.from_numpy(channel_weights(mips[0], self.config.channel_weights)).to(device)
         self._net = model.net.clone()  # what the kernel reads: rounded in the last stage
         patches = max(1, plan.batch // PATCH)
-        self.step = Step(
-            pyramids, shape, model.texels, self._net, reference, patches, self._parts, self.channel_weight
-        )
+        self.step = Step(pyramids, shape, model.texels, self._net, reference, patches, self._parts, self.channel_weight)
         self._blocks = BlockJobs(
             model.endpoints, model.positions, model.shapes, model.modes, model.texels, self.step.texel_gradient,
             self.config.signed,
@@ -125,7 +140,7 @@ class BlockTrainer:
         model = self.model
         model.net.copy_(model.net.half().float())
         decoded = bc6h_decode(self.packed, self.config.signed).reshape(-1, 3).astype(np.float32)
-        if not np.array_equal(decoded, model.texels[:, :3].numpy()):
+        if not np.array_equal(decoded, model.texels[:, :3].cpu().numpy()):
             raise RuntimeError("the packed blocks do not decode to the trained features; please report this")
         return {
             "seconds": round(self._elapsed["total"], 2),
@@ -143,6 +158,8 @@ class BlockTrainer:
             self._begin(stage)
         elif stage.begin == "freeze":
             self.packed = model.blocks()
+        real = model.modes > 0
+        self._frozen = real if self.config.quantisation == "sequential" and bool(real.any()) else None
         values = {name: getattr(model, name) for name in stage.rates}
         groups = [{"params": [value], "lr": stage.rates[name][0]} for name, value in values.items()]
         parameters = list(values.values())
@@ -175,43 +192,66 @@ class BlockTrainer:
 
     def _begin(self, stage: Stage) -> None:
         model = self.model
-        if stage.begin in ("encode", "quantise"):
+        if stage.begin == "encode":
             self._report(stage, f"{stage.name}: choosing modes and partitions")
-            if stage.begin == "quantise" and self.stages[self._stage - 1].name != "released":
-                model.modes.zero_()  # choose from the continuous values, which remember more than their codes
-                self._blocks.decode()
-            model.encode("single" if self.config.modes == "single" else "all")
-            if stage.begin == "encode":
-                model.modes.zero_()
+            model.encode(self.config.modes, self.sensitivity())
+            model.modes.zero_()
+            self._blocks.decode()
+        elif stage.begin == "quantise":
+            part = (0, len(model.modes)) if stage.texture is None else model.block_range(stage.texture)
+            self._report(stage, f"{stage.name}: choosing modes and partitions")
+            model.encode(self.config.modes, self.sensitivity(), part)
             self._blocks.decode()
         elif stage.begin == "random":
             model.random_blocks(torch.Generator().manual_seed(self.plan.seed))
             self._blocks.decode()
         elif stage.begin == "freeze":
-            if not self.config.qat:
-                model.encode("single" if self.config.modes == "single" else "all")
+            if self.config.quantisation == "once":
+                model.encode(self.config.modes, self.sensitivity())
             self.packed = model.blocks()
             self._blocks.decode()
 
+    def sensitivity(self) -> torch.Tensor | None:
+        """Return how much the loss cares for each texel, (P, 4): the diagonal of JᵀJ from :data:`PROBES` probes."""
+        if not self.config.sensitivity:
+            return None
+        self._net.copy_(self.model.net)
+        total = torch.zeros_like(self.model.texels)
+        for number in range(PROBES):
+            key = ((self._count + 1) * 40503 + number * 2654435761) & 0x7FFFFFFF
+            self.step.run(self._patches(1_000_000_000 + self._count * PROBES + number), key, probe=True)
+            total += self.step.texel_gradient.sum(0).square_()
+        return total / PROBES
+
+    def _patches(self, number: int) -> torch.Tensor:
+        config = self.config
+        return torch.from_numpy(
+            draw_patches(
+                self.plan.seed,
+                number,
+                len(self.step.patches),
+                config.pyramids,
+                decay=config.mip_decay,
+                aligned=config.aligned,
+            )  # fmt: skip
+        )
+
     def _gradients(self, stage: Stage) -> None:
-        config, model = self.config, self.model
+        model = self.model
         if "endpoints" in stage.rates:
             self._blocks.decode()
         self._net.copy_(model.net.half() if stage.begin == "freeze" else model.net)
-        patches = draw_patches(
-            self.plan.seed, self._count, len(self.step.patches), config.pyramids,
-            decay=config.mip_decay, aligned=config.aligned,
-        )  # fmt: skip
         key = (self._count * 2654435761 + self.plan.seed * 40503) & 0x7FFFFFFF
-        self.step.run(torch.from_numpy(patches), key)
+        self.step.run(self._patches(self._count), key)
         if "endpoints" in stage.rates:
             self._blocks.adjoint()
 
     def _gradient(self, name: str) -> torch.Tensor:
-        if name == "endpoints":
-            return self._blocks.endpoint_gradient
-        if name == "positions":
-            return self._blocks.position_gradient
+        if name in ("endpoints", "positions"):
+            gradient = self._blocks.endpoint_gradient if name == "endpoints" else self._blocks.position_gradient
+            if self._frozen is not None:
+                gradient[self._frozen] = 0.0
+            return gradient
         parts = self.step.texel_gradient if name == "texels" else self.step.weight_gradient
         return parts[0] if len(parts) == 1 else parts.sum(0)
 

@@ -7,6 +7,7 @@ leave a checkpoint beside the output and go on from there with ``resume=True``.
 from __future__ import annotations
 
 import difflib
+import json
 import math
 import os
 from pathlib import Path
@@ -48,6 +49,16 @@ class BRDFData:
         """Return ``sampler(rng, count)`` for :class:`warp_neumat.training.loop.Trainer`."""
         return lambda rng, count: samplers.BRDFSampler(source, rng).draw(count)
 
+    @staticmethod
+    def opening(source, arguments: dict) -> dict:
+        """Return what the header keeps of how the source was opened, JSON-able."""
+        return {}
+
+    @staticmethod
+    def described(source, shape) -> str:
+        """Return what was understood of the source and what will be made of it, for people; may be empty."""
+        return ""
+
     @classmethod
     def trainer(cls, module, source, shape, plan, device, **more):
         """Return what ``run`` and ``resume`` are called on."""
@@ -73,22 +84,42 @@ class MapData:
     def configured(module, source, preset, options):
         """Return (length factor, batch, config); a preset names the sizes of the features, or the length."""
         length = preset if preset in PRESETS else None
-        batch = options.pop("batch", MapData.BATCH)
-        if isinstance(batch, bool) or not isinstance(batch, int) or batch < 256 or batch % 256:
+        batch = options.pop("batch", None)
+        if batch is not None and (isinstance(batch, bool) or not isinstance(batch, int) or batch < 256 or batch % 256):
             raise ValueError(f"batch must be a multiple of 256, got {batch!r}")
         if preset is not None and length is None:
             _length(preset, {**PRESETS, **module.PRESETS})
-            return 1.0, batch, module.configure(source, options, preset)
-        return _length(length, PRESETS), batch, module.configure(source, options)
+        shape = module.configure(source, options, None if length else preset)
+        return _length(length, PRESETS), batch or MapData.batch(shape), shape
+
+    @staticmethod
+    def batch(shape) -> int:
+        """Return the samples a step takes: 2¹⁴, and in proportion to the features beyond 2¹⁷ texels, up to 2¹⁷."""
+        share = shape.pyramids.texel_count / (1 << 17)
+        return 256 * round(min(max(share, 1.0), 8.0) * MapData.BATCH / 256)
+
+    @staticmethod
+    def opening(source, arguments: dict) -> dict:
+        """Return the arguments that open the source equally: size and crop as they were settled, and overrides."""
+        settled = source.manifest()
+        found = {name: settled[name] for name in ("size", "crop") if name in settled}
+        if arguments.get("overrides"):
+            found["overrides"] = json.loads(json.dumps(arguments["overrides"], default=os.fspath))
+        return found
+
+    @staticmethod
+    def described(source, shape) -> str:
+        """Return the table of maps and a line on the feature textures."""
+        sizes = ", ".join(f"{width}×{height}" for width, height in shape.features)
+        return f"{source.table()}\nfeature textures: {sizes}"
 
     @staticmethod
     def trainer(module, source, shape, plan, device, *, checkpoint, **more):
         """Return the trainer of the texture set."""
-        if torch.device(device).type != "cpu":
-            raise ValueError(f"bcf trains on the CPU, got device {device}; render with it on any device")
         mips = source.mips()
         mean = mips[0].reshape(-1, mips[0].shape[2]).mean(axis=0)
-        return BlockTrainer(module.build(shape, plan.seed, mean), mips, plan, checkpoint_path=checkpoint, **more)
+        model = module.build(shape, plan.seed, mean).to(device)
+        return BlockTrainer(model, mips, plan, checkpoint_path=checkpoint, **more)
 
     @staticmethod
     def stored(module, source, trainer) -> tuple[dict, dict, dict]:
@@ -102,23 +133,37 @@ class MapData:
 DATA = {"brdf": BRDFData, "maps": MapData}
 
 
+def default_model(source) -> str:
+    """Return the model that a source is for: ``bcf`` where it is a folder or a manifest, else ``neubrdf``."""
+    if isinstance(source, dict) or str(source).lower().endswith(".json") or os.path.isdir(source):
+        return "bcf"
+    return "neubrdf"
+
+
+def presets(model: str) -> tuple[str, ...]:
+    """Return the names that ``fit(…, preset=…)`` knows for ``model``."""
+    return tuple({**getattr(models.find(model), "PRESETS", {}), **PRESETS})
+
+
 def checkpoint_path(out: Path) -> Path:
     """Return where the checkpoint of a fit to ``out`` lies."""
     return out.with_name(out.name + ".checkpoint")
 
 
 def fit(
-    source: str,
+    source: str | os.PathLike | dict,
     out: str | os.PathLike,
     *,
-    model: str = "neubrdf",
+    model: str | None = None,
     steps: int | None = None,
     seed: int = 0,
     device: str = "cpu",
     preset: str | None = None,
     resume: bool = False,
     progress=None,
+    announce=None,
     budget_seconds: float | None = None,
+    checkpoint_seconds: float = Plan.checkpoint_seconds,
     **config,
 ) -> dict:
     """Fit ``model`` to ``source``, write the asset to ``out``, and return its header and how long it took.
@@ -129,14 +174,16 @@ def fit(
         source: As for :func:`warp_neumat.io.brdf.open_brdf`, or for model ``bcf`` as for
             :func:`warp_neumat.io.texture_set.open_texture_set`.
         out: The ``.neumat`` file to write; replaced if it exists. Its folder must exist.
-        model: Name in :data:`warp_neumat.models.REGISTRY`.
+        model: Name in :data:`warp_neumat.models.REGISTRY`; default: :func:`default_model`.
         steps: Optimiser steps; default: the model's, times the preset's factor.
         seed: Same seed, same file (on one machine with the same number of threads).
         device: torch device.
         preset: One of :data:`PRESETS`; for ``bcf`` also one of :data:`warp_neumat.models.bcf.PRESETS`.
         resume: Go on from the checkpoint beside ``out`` where there is one.
         progress: ``progress(fraction, text)``.
+        announce: ``announce(text)``, called once before the training with what was understood of a texture set.
         budget_seconds: Train for this time instead of ``steps``; then the tensors depend on the machine's speed.
+        checkpoint_seconds: Longest stretch of work that an interruption can cost.
         config: Fields of the model's config, as ``nside=32`` or ``features=(256, 128, 64, 32)``; for ``bcf`` also
             ``batch`` and the keyword arguments of ``open_texture_set``.
 
@@ -146,21 +193,27 @@ def fit(
         FloatingPointError: If the training diverges.
     """
     out = Path(out)
+    model = default_model(source) if model is None else model
     module = models.find(model)
     kind = DATA[module.DATA]
     opening = {name: config.pop(name) for name in kind.OPTIONS if name in config}
     seed = _whole("seed", seed, 0)
     if budget_seconds is not None and not budget_seconds > 0:
         raise ValueError(f"budget_seconds must be above 0, got {budget_seconds}")
+    if not checkpoint_seconds >= 0:
+        raise ValueError(f"checkpoint_seconds must be at least 0, got {checkpoint_seconds}")
     opened = kind.open(source, **opening)
     factor, batch, shape = kind.configured(module, opened, preset, dict(config))
     steps = round(module.DEFAULT_STEPS * factor) if steps is None else _whole("steps", steps, 1)
-    plan = Plan(steps=steps, batch=batch, seed=seed, budget_seconds=budget_seconds)
+    plan = Plan(steps, batch, seed, budget_seconds, checkpoint_seconds)
     check_writable(out)  # now, not after minutes of training
+    if announce and (text := kind.described(opened, shape)):
+        announce(text)
     threads = torch.get_num_threads()
     torch.set_num_threads(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
     try:
-        identity = {"source": _named(source), "opening": repr(opening), "model": model, "config": repr(shape)}
+        settled = kind.opening(opened, opening)
+        identity = {"source": _named(source), "opening": settled, "model": model, "config": repr(shape)}
         more = {"checkpoint": checkpoint_path(out), "identity": identity, "progress": progress}
         trainer = kind.trainer(module, opened, shape, plan, _device(device), **more)
         if resume and not trainer.resume() and progress:
@@ -169,6 +222,8 @@ def fit(
         tensors, header, metrics = kind.stored(module, opened, trainer)
         size = sum(tensor.nbytes for tensor in tensors.values())
         header["source"] = {"spec": _named(source), "name": opened.name}
+        if settled:
+            header["source"]["opening"] = settled
         seconds = facts.pop("seconds")  # returned, but not stored: the same seed gives the same file
         header["training"] = {**facts, **trainer.model.statistics()}
         header["metrics"] = {**metrics, "bytes": size}

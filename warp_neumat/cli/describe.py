@@ -1,0 +1,54 @@
+"""What ``neumat info`` prints of an asset below its first line."""
+
+import math
+
+
+def describe(header: dict, tensors: dict) -> list[str]:
+    """Return the lines of an asset's header and tensors (name → dtype, shape, bytes), by kind."""
+    lines = _maps(header.get("config", {}), tensors) if header["kind"] == "bcf" else _fields(header, "config")
+    for part in ("source", "training", "metrics"):
+        lines += _fields(header, part)
+    for name, note in header.get("maps", {}).get("files", {}).items():
+        lines.append(f"  maps.{name}: {note}")
+    if header["kind"] != "bcf":
+        lines += [f"  {name}: {t['dtype']} {t['shape']}, {t['bytes']} bytes" for name, t in tensors.items()]
+    return lines
+
+
+def _fields(header: dict, part: str) -> list[str]:
+    found = header.get(part, {}).items()
+    return [
+        f"  {part}.{key}: {value:.6g}" if isinstance(value, float) else f"  {part}.{key}: {value}"
+        for key, value in found
+    ]
+
+
+def _maps(config: dict, tensors: dict) -> list[str]:
+    """Return what a bcf is made of: size, textures with their mips, network, channels, constants."""
+    width, height, channels = config["width"], config["height"], config["channels"]
+    total = sum(t["bytes"] for t in tensors.values())
+    bits = 8 * total / (width * height * len(channels))
+    lines = [
+        f"  material: {width}×{height}, {len(channels)} channels, wrap {config['wrap']}, {bits:.3g} bit/texel/channel"
+    ]
+    for number, texture in enumerate(config["textures"]):
+        size = sum(t["bytes"] for name, t in tensors.items() if name.startswith(f"texture{number}.mip"))
+        level = max(0.0, math.log2(max(width / texture["width"], height / texture["height"])))
+        kind = "bc6h_sf16" if config["signed"] else "bc6h_uf16"
+        lines.append(
+            f"  texture{number}: {kind} {texture['width']}×{texture['height']}, {texture['mips']} mips, {size} bytes, "
+            f"sharp from mip {level:.3g} of the material on"
+        )
+    hidden, size = config["hidden"], sum(t["bytes"] for name, t in tensors.items() if not name.startswith("texture"))
+    lines.append(f"  network: {3 * len(config['textures'])}→{hidden}→{len(channels)}, float16, {size} bytes")
+    maps: dict[str, list[dict]] = {}
+    for channel in channels:
+        maps.setdefault(channel["map"], []).append(channel)
+    for name, own in maps.items():
+        parts = " ".join(channel["component"] for channel in own)
+        low, high = min(c["range"][0] for c in own), max(c["range"][1] for c in own)
+        spread = "" if (low, high) == (0, 1) else f", {low:.4g} … {high:.4g}"
+        lines.append(f"  {name}: {parts} ({own[0]['encoding']}{spread})")
+    for name, values in config.get("constants", {}).items():
+        lines.append(f"  {name}: constant {' '.join(f'{v:.4g}' for v in values)}")
+    return lines
