@@ -53,7 +53,7 @@ class QuantisedFeatures:
     def _train(self, mips) -> None:
         model, pyramids, shape = self.model, self.config.pyramids, self.config.shape
         latent, net = model.texels.clone(), model.net
-        reference = torch.from_numpy(pad_reference(mips, shape.stride, True))
+        reference = torch.from_numpy(pad_reference(mips, shape.stride, "repeat"))
         step = Step(pyramids, shape, model.texels, net, reference, MapData.BATCH // PATCH, 2)
         optimiser = torch.optim.Adam(
             [{"params": [latent], "lr": 2e-2}, {"params": [net], "lr": 5e-3}], betas=(0.9, 0.99), eps=1e-14, fused=True

@@ -35,8 +35,13 @@ COLUMNS = [
 ]  # fmt: skip
 
 _PAPER = {
-    "quantisation": "once", "modes": "single", "sensitivity": False, "mip_decay": 0.0, "aligned": 0.0, "smallest_mip": 4,
-}  # fmt: skip
+    "quantisation": "once",
+    "modes": "single",
+    "sensitivity": False,
+    "mip_decay": 0.0,
+    "aligned": 0.0,
+    "smallest_mip": 4,
+}
 
 OPTIONS = {
     "defaults": {},
@@ -50,11 +55,8 @@ OPTIONS = {
     "no samples on texel centres": {"aligned": 0.0},
     "last mip 4x4": {"smallest_mip": 4},
     "channels weighted by variance": {"channel_weights": "variance"},
-    "as the paper": {
-        "quantisation": "once", "sensitivity": False, "modes": "single", "mip_decay": 0.0, "aligned": 0.0,
-        "smallest_mip": 4,
-    },
-}  # fmt: skip
+    "as the paper": _PAPER,
+}
 """Method → what differs from the defaults of the fit, with the preset of BCf-1k."""
 
 QUANTISED = {

@@ -18,7 +18,10 @@ def test_every_test_that_is_cited_exists():
 
 def test_every_file_that_is_cited_exists():
     for text in [*(ROOT / "docs").glob("*.md"), ROOT / "README.md"]:
-        for path in re.findall(r"`((?:tests|kernels|models|reference|pipeline|bench|docs|export|training|ops|io|materials)/[\w/.]+)`", text.read_text()):
+        for path in re.findall(
+            r"`((?:tests|kernels|models|reference|pipeline|bench|docs|export|training|ops|io|materials)/[\w/.]+)`",
+            text.read_text(),
+        ):
             assert (ROOT / path).exists() or (ROOT / "warp_neumat" / path).exists(), f"{text.name}: {path}"
 
 

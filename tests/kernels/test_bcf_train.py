@@ -31,17 +31,17 @@ def test_layout_leaves_no_gap_and_no_overlap():
     np.testing.assert_allclose(layout.biases, np.log2([1 / 2, max(12 / 32, 20 / 64), max(4 / 32, 4 / 64)]))
 
 
-@pytest.mark.parametrize("repeat", [True, False])
-def test_reference_is_padded_as_it_wraps(rng, repeat):
-    layout = pyramids(6, 3, repeat)
+@pytest.mark.parametrize(("wrap", "mode"), [("repeat", "wrap"), ("clamp", "edge"), ("mirror", "symmetric")])
+def test_reference_is_padded_as_it_wraps(rng, wrap, mode):
+    layout = pyramids(6, 3, wrap == "repeat")
     mips = [rng.random((h, w, 5)).astype(np.float32) for w, h in layout.reference]
-    flat = pad_reference(mips, 8, repeat)
+    flat = pad_reference(mips, 8, wrap)
     assert flat.dtype == np.float16
     assert len(flat) == 8 * layout.reference_offsets[-1]
     for mip, offset in zip(mips, layout.reference_offsets[:-1], strict=True):
         h, w, _ = mip.shape
         stored = flat[8 * offset :][: 8 * (h + 4) * (w + 4)].reshape(h + 4, w + 4, 8)
-        expected = np.pad(mip, ((2, 2), (2, 2), (0, 0)), mode="wrap" if repeat else "edge")
+        expected = np.pad(mip, ((2, 2), (2, 2), (0, 0)), mode=mode)
         np.testing.assert_array_equal(stored[:, :, :5], expected.astype(np.float16))
         assert not stored[:, :, 5:].any()
 

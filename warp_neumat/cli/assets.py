@@ -71,7 +71,7 @@ def fit(
     ] = None,
     device: Device = "cpu",
 ):
-    """Fit a material to a folder of PBR maps or to a reflectance function.
+    """Fit a material to PBR maps or a reflectance function.
 
     \b
     neumat fit bricks/ -o bricks.neumat --preset 1k
@@ -240,7 +240,7 @@ def decode(
     bits: Annotated[int, typer.Option(help="Bits of a channel in PNG: 8 or 16.")] = 8,
     device: Device = "cpu",
 ):
-    """Turn a bcf back into PNG and EXR maps, for tools that know no neural material.
+    """Turn a bcf back into PNG and EXR maps.
 
     \b
     neumat decode bricks.neumat -o maps/ --size 1024x1024
@@ -268,7 +268,9 @@ def export(
         ),
     ] = None,
 ):
-    """Write a bcf as an engine reads it: BC6H textures, fp16 weights, manifest, decoder source.
+    """Write a bcf as an engine reads it.
+
+    BC6H textures with mips, the network in float16, a manifest with a golden vector, and decoder source.
 
     \b
     neumat export bricks.neumat -o engine/ --format ktx2 --shader wgsl

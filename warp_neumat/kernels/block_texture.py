@@ -141,13 +141,25 @@ for (int t = 0; t < 16; ++t) {
 }
 """
 
+# Samples of a step touch about a third of the blocks; of the others nothing is done but to see that.
+_SUM = """
+float GW[64];
+int touched = 0;
+const float* const given = gradients.data + 64ll * block;
+for (int i = 0; i < 64; ++i) GW[i] = given[i];
+for (int q = 1; q < parts; ++q) for (int i = 0; i < 64; ++i) GW[i] += given[64ll * count * q + i];
+for (int i = 0; i < 64; ++i) touched |= GW[i] != 0.0f;
+if (!touched) {
+    for (int k = 0; k < 12; ++k) endpoint_gradient.data[12ll * block + k] = 0.0f;
+    for (int t = 0; t < 16; ++t) position_gradient.data[16ll * block + t] = 0.0f;
+    return;
+}
+"""
+
 _BACKWARD = """
 const float scale = mode == 0 ? 1.0f : 0.015625f;
 for (int t = 0; t < 16; ++t) X[t] *= scale;
-float GX[16]; float GE[4][3]; float GW[64];
-for (int i = 0; i < 64; ++i) GW[i] = gradients.data[64ll * block + i];
-for (int q = 1; q < parts; ++q) for (int i = 0; i < 64; ++i)
-    GW[i] += gradients.data[64ll * (block + (long long)q * count) + i];
+float GX[16]; float GE[4][3];
 for (int t = 0; t < 16; ++t) GX[t] = 0.0f;
 for (int c = 0; c < 3; ++c) {
     const float a0 = E[0][c], a1 = E[2][c], d0 = E[1][c] - a0, d1 = E[3][c] - a1;
@@ -187,7 +199,9 @@ def make_block_kernels():
         texels: wp.array(dtype=wp.float32),
     ): ...
 
-    @wp.func_native(_tables() + "const float low = is_signed ? -0.99996850f : 0.0f;" + _HALF + _QUANTISE + _BACKWARD)
+    @wp.func_native(
+        _SUM + _tables() + "const float low = is_signed ? -0.99996850f : 0.0f;" + _HALF + _QUANTISE + _BACKWARD
+    )
     def adjoint_block(
         block: int,
         count: int,

@@ -84,16 +84,22 @@ class Pyramids:
         return rows
 
 
-def pad_reference(mips, stride: int, repeat: bool) -> np.ndarray:
+def _wrapped(index: np.ndarray, side: int, wrap: str) -> np.ndarray:
+    """Return the texels that a sampler reads for ``index``, which may lie outside 0 … side − 1."""
+    if wrap == "repeat":
+        return index % side
+    if wrap == "clamp":
+        return index.clip(0, side - 1)
+    turned = index % (2 * side)
+    return np.minimum(turned, 2 * side - 1 - turned)
+
+
+def pad_reference(mips, stride: int, wrap: str) -> np.ndarray:
     """Return the reference pyramid as the kernel reads it, flat float16; ``mips`` are (h, w, C) in [0, 1]."""
     parts = []
     for mip in mips:
         h, w, c = mip.shape
-        rows, columns = np.arange(-PAD, h + PAD), np.arange(-PAD, w + PAD)
-        if repeat:
-            rows, columns = rows % h, columns % w
-        else:
-            rows, columns = rows.clip(0, h - 1), columns.clip(0, w - 1)
+        rows, columns = (_wrapped(np.arange(-PAD, side + PAD), side, wrap) for side in (h, w))
         padded = np.zeros((h + 2 * PAD, w + 2 * PAD, stride), np.float16)
         padded[..., :c] = mip[rows][:, columns]
         parts.append(padded.reshape(-1))
@@ -117,7 +123,7 @@ def draw_patches(
     top = len(pyramids.reference) - 1
     low, high = -0.5, top + 0.5
     q = (np.arange(count) + draw.random(count)) / count
-    if decay > 0:
+    if decay > 1e-3:
         edge = 2.0 ** (-decay * (high - low))
         raw = low - np.log2(1.0 - q * (1.0 - edge)) / decay
         weight = (1.0 - edge) / ((high - low) * decay * math.log(2.0)) * 2.0 ** (decay * (raw - low))

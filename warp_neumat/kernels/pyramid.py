@@ -2,7 +2,7 @@
 
 Unlike :mod:`~.bcf_train`, which fuses a whole training step, these kernels take any coordinates and a level of its own
 for every sample: the building block for other losses and other samplers. Texels are float32 rows of four (r, g, b,
-unused), block by block as :class:`~.bcf_train.Pyramids` lays out one texture. Wrap modes, texel centres and what
+unused), block by block as :class:`~.patches.Pyramids` lays out one texture. Wrap modes, texel centres and what
 becomes of numbers that are not finite are those of :mod:`~.filter`.
 
 One source serves CPU and CUDA. The scatter sums in one buffer per part: a CPU has a few parts, each the work of one

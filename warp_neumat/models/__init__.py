@@ -1,10 +1,14 @@
 """The fitting side of every model. A model is a module; the registry imports it only when it is asked for.
 
-What :mod:`warp_neumat.training` relies on, of a module: ``DATA`` (kind of source), ``configure(source, options) ->
-config``, ``build(config, seed) -> model``, ``from_asset(tensors, config) -> model``, ``DEFAULT_STEPS``; of a model (a
-``torch.nn.Module``): ``prepare(samples) -> batch``, ``predict(batch)``, ``event_samples()``, ``stages()``,
-``trainable(stage)``, ``begin``, ``enter``, ``event``, ``to_asset()``, ``statistics()`` and ``evaluate(*inputs)``;
-:class:`warp_neumat.models.neubrdf.NeuBRDF` says what each does.
+What :mod:`warp_neumat.training` relies on, of every module: ``DATA`` (kind of source, which decides who trains it),
+``configure(source, options) -> config``, ``build(config, seed, …) -> model`` (a ``torch.nn.Module``) and
+``DEFAULT_STEPS``; of a model: ``to_asset(…)`` and ``statistics()``.
+
+Models of reflectance functions (``DATA = "brdf"``) are trained by :mod:`warp_neumat.training.loop` and further have
+``from_asset(tensors, config)``, ``prepare(samples) -> batch``, ``predict(batch)``, ``event_samples()``, ``stages()``,
+``trainable(stage)``, ``begin``, ``enter``, ``event`` and ``evaluate(*inputs)``;
+:class:`warp_neumat.models.neubrdf.NeuBRDF` says what each does. Models of texture sets (``"maps"``) are trained by
+:mod:`warp_neumat.training.block_loop`, which knows the buffers of :class:`warp_neumat.models.bcf.BCf`.
 """
 
 import difflib

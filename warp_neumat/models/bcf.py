@@ -232,7 +232,7 @@ class BCf(nn.Module):
         low, high = (math.log2(v) for v in self.config.feature_range)
         centre = ((low + high) / 2 + 15) / 31
         spread = torch.rand(self.endpoints.shape, generator=generator) - 0.5
-        self.endpoints.copy_(centre + spread * (high - low) / 62)
+        self.endpoints.copy_(centre + spread * (high - low) / 31)
         self.positions.copy_(torch.rand(self.positions.shape, generator=generator))
         self.shapes.copy_(torch.randint(0, 32, self.shapes.shape, generator=generator))
         self.modes.zero_()

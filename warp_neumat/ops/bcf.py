@@ -10,6 +10,11 @@ from warp_neumat.ops.block_texture import flat
 from warp_neumat.ops.stream import torch_stream
 
 
+def _check(name: str, tensor: torch.Tensor, dtype: torch.dtype, shape: tuple[int, ...]) -> None:
+    if tensor.dtype != dtype or tuple(tensor.shape) != shape:
+        raise ValueError(f"{name} must be {dtype} of shape {shape}, got {tensor.dtype} {tuple(tensor.shape)}")
+
+
 class Step:
     """A training step with buffers of its own, recorded once and replayed without allocation.
 
@@ -35,13 +40,15 @@ class Step:
     ):
         wp.init()
         device = texels.device
-        if texels.shape != (pyramids.texel_count, 4) or net.shape != (shape.weights,):
-            raise ValueError(
-                f"texels must have shape {(pyramids.texel_count, 4)} and net {(shape.weights,)}, "
-                f"got {tuple(texels.shape)} and {tuple(net.shape)}"
-            )
         if channel_weight is None:
             channel_weight = torch.ones(shape.channels, device=device)
+        words = pyramids.reference_offsets[-1] * shape.stride
+        _check("texels", texels, torch.float32, (pyramids.texel_count, 4))
+        _check("net", net, torch.float32, (shape.weights,))
+        _check("reference", reference, torch.float16, (words,))
+        _check("channel_weight", channel_weight, torch.float32, (shape.channels,))
+        if len(pyramids.features) != shape.textures:
+            raise ValueError(f"pyramids have {len(pyramids.features)} textures, the network takes {shape.textures}")
         table = torch.from_numpy(pyramids.table()).to(device)
         mips = torch.tensor([len(m) for m in pyramids.features], dtype=torch.int32, device=device)
         biases = torch.tensor(pyramids.biases, dtype=torch.float32, device=device)
@@ -74,6 +81,8 @@ class Step:
         With ``probe`` the residuals are random signs: the squares of the texels' gradient average, over keys, to the
         diagonal of JᵀJ, how much the outputs care for each texel. Losses are left as they were.
         """
+        if patches.shape != self.patches.shape:
+            raise ValueError(f"patches must have shape {tuple(self.patches.shape)}, got {tuple(patches.shape)}")
         self.patches.copy_(patches)
         self.texel_gradient.zero_()
         self.weight_gradient.zero_()

@@ -4,9 +4,9 @@ import torch
 import warp as wp
 
 from warp_neumat.kernels import pyramid as kernels
-from warp_neumat.kernels.patches import Pyramids
 from warp_neumat.kernels.dispatch import launch
 from warp_neumat.kernels.filter import MOST_MIPS, WRAPS
+from warp_neumat.kernels.patches import Pyramids
 from warp_neumat.ops.stream import torch_stream
 
 PARTS = 4
@@ -136,7 +136,7 @@ def pyramid_sample(texels, uv, lod, sizes, wrap: str = "repeat") -> torch.Tensor
 
     Args:
         texels: (P, 4) float32: r, g, b, unused; 4 × 4 blocks row by row, mips one after another, as
-            :class:`warp_neumat.kernels.bcf_train.Pyramids` lays them out.
+            :class:`warp_neumat.kernels.patches.Pyramids` lays them out.
         uv: (N, 2) float32, origin top left, texel centres at (i + 0.5)/W.
         lod: (N,) float32, the level of each sample in this pyramid; limited to the mips there are.
         sizes: (width, height) of each mip, finest first.

@@ -118,7 +118,7 @@ class BlockTrainer:
         pyramids, shape = self.config.pyramids, self.config.shape
         device = model.texels.device
         self._parts = min(MOST_PARTS, dispatch.worker_count()) if device.type == "cpu" else 1
-        reference = torch.from_numpy(pad_reference(mips, shape.stride, pyramids.repeat)).to(device)
+        reference = torch.from_numpy(pad_reference(mips, shape.stride, self.config.wrap)).to(device)
         self.channel_weight = torch.from_numpy(channel_weights(mips[0], self.config.channel_weights)).to(device)
         self._net = model.net.clone()  # what the kernel reads: rounded in the last stage
         patches = max(1, plan.batch // PATCH)
