@@ -114,9 +114,8 @@ class Lab:
                 from ._quantised import QuantisedFeatures
 
                 channels, bits, scale = config["quantise"]
-                material = QuantisedFeatures(
-                    opened, mips, channels=channels, bits=bits, scale=scale, steps=self.choice.steps, seed=self.choice.seed
-                )
+                plan = {"steps": self.choice.steps, "seed": self.choice.seed}
+                material = QuantisedFeatures(opened, mips, channels=channels, bits=bits, scale=scale, **plan)
                 found, size, seconds = map_metrics(opened, material.encoded), material.bytes, None
             else:
                 material, seconds = self.material(name, method if config is None else "BCf-1k", config or {})

@@ -238,6 +238,8 @@ def test_a_broken_picture_is_one_line(run, maps, tmp_path, keep):
         (("--override", "roughness=rough"), 2, "--override roughness must be a number"),
         (("--override", "roughness=0", "--override", "roughness.invert=true"), 2, "roughness is already overridden"),
         (("--option", "wrpa=clamp"), 1, "no option 'wrpa' of bcf; nearest: wrap"),
+        (("--option", "wrap=3"), 1, "wrap must be repeat, clamp or mirror, got 3"),
+        (("--option", "aligned=much"), 1, "an option is of the wrong type: aligned='much'"),
         (("--option", "wrap"), 2, "--option must be NAME=VALUE"),
         (("--option", "steps=5"), 2, "--option steps: has an option of its own"),
         (("--option", "batch=100"), 1, "batch must be a multiple of 256"),

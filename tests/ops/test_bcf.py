@@ -34,7 +34,8 @@ class Problem:
         self.texels, self.net = self.model.texels, self.model.net
         self.texels[:, :3] += 0.3 * torch.from_numpy(rng.normal(size=(len(self.texels), 3)))
         self.net += 0.05 * torch.from_numpy(rng.normal(size=len(self.net)))
-        self.reference = torch.from_numpy(pad_reference(self.mips, self.shape.stride, "repeat" if self.pyramids.repeat else "clamp"))
+        wrap = "repeat" if self.pyramids.repeat else "clamp"
+        self.reference = torch.from_numpy(pad_reference(self.mips, self.shape.stride, wrap))
         self.patches = self.drawn(**drawn)
 
     def drawn(self, count=12, aligned=0.5):

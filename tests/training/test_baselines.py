@@ -173,6 +173,17 @@ def naive_bc1(pixels):
     return result
 
 
+def test_astc_leaves_the_strings_of_the_process_alone(rng):
+    """The encoder's swizzle turns its argument into capitals in place, and a literal is one object for all modules."""
+    pytest.importorskip("astc_encoder")
+    channels = [SimpleNamespace(map="base_color", component=c, encoding="srgb") for c in ("red", "green", "blue")]
+    channels += [SimpleNamespace(map="normal", component=c, encoding="normal") for c in ("x", "y")]
+    channels += [SimpleNamespace(map="roughness", component="value", encoding="linear")]
+    Baseline("astc12", channels, [rng.random((12, 12, 6)).astype(np.float32)], astc_quality=0).level(0)
+    for literal, codes in (("rgba", "72676261"), ("rgb1", "72676231"), ("rrrg", "72727267"), ("ra01", "72613031")):
+        assert literal.encode().hex() == codes
+
+
 def test_bc1_beats_blocks_made_without_search(rng):
     pytest.importorskip("quicktex")
     pixels = smooth(rng, 64, 64, 3)

@@ -244,7 +244,12 @@ def _astc(context, normal: bool, pixels: np.ndarray) -> np.ndarray:
     rgba[..., :count] = pixels
     order = "rrrg" if normal else {1: "rrr1", 2: "rg01", 3: "rgb1"}[count]
     picture = astc.ASTCImage(astc.ASTCType.F32, width, height, 1, rgba.tobytes())
-    data = context.compress(picture, astc.ASTCSwizzle.from_str(order))
-    back = astc.ASTCSwizzle.from_str("ra01" if normal else "rgba")
+    data = context.compress(picture, _swizzle(astc, order))
+    back = _swizzle(astc, "ra01" if normal else "rgba")
     decoded = context.decompress(data, astc.ASTCImage(astc.ASTCType.F32, width, height), back)
     return np.frombuffer(decoded.data, np.float32).reshape(height, width, 4)[..., :count]
+
+
+def _swizzle(astc, order: str):
+    """Return ``order`` as the package's swizzle: of a copy, as it writes capitals into the very string it is given."""
+    return astc.ASTCSwizzle.from_str(order.encode().decode())

@@ -282,7 +282,8 @@ class BlockTrainer:
         self.progress(min(1.0, before + stage.share * min(1.0, self._position(stage))), text)
 
     def _facts(self) -> dict:
-        return {"plan": dataclasses.asdict(self.plan), "threads": self._parts, **self.identity}
+        plan = {k: v for k, v in dataclasses.asdict(self.plan).items() if k != "checkpoint_seconds"}
+        return {"plan": plan, "threads": self._parts, **self.identity}
 
     def _save_if_due(self, optimiser, parameters) -> None:
         if self.checkpoint is None or time.monotonic() - self._last_save < self.plan.checkpoint_seconds:
@@ -290,7 +291,8 @@ class BlockTrainer:
         self._tick()
         tensors = {f"model.{name}": value for name, value in self.model.state_dict().items()}
         tensors |= checkpoint.optimiser_tensors(optimiser, parameters)
-        state = {"stage": self._stage, "step": self._step, "count": self._count, "elapsed": self._elapsed}
+        loss = self.last_loss if math.isfinite(self.last_loss) else None
+        state = {"stage": self._stage, "step": self._step, "count": self._count, "elapsed": self._elapsed, "loss": loss}
         checkpoint.save(self.checkpoint, tensors, state, self._facts())
         self._last_save = time.monotonic()
 
@@ -306,6 +308,7 @@ class BlockTrainer:
         self.model.load_state_dict({k.removeprefix("model."): v for k, v in tensors.items() if k.startswith("model.")})
         self._stage, self._step, self._count = state["stage"], state["step"], state["count"]
         self._elapsed = state["elapsed"]
+        self.last_loss = math.nan if state["loss"] is None else state["loss"]
         self._pending = {name: value for name, value in tensors.items() if name.startswith("optimiser.")}
         return True
 

@@ -89,7 +89,11 @@ class MapData:
             raise ValueError(f"batch must be a multiple of 256, got {batch!r}")
         if preset is not None and length is None:
             _length(preset, {**PRESETS, **module.PRESETS})
-        shape = module.configure(source, options, None if length else preset)
+        try:
+            shape = module.configure(source, options, None if length else preset)
+        except TypeError as error:
+            given = ", ".join(f"{name}={value!r}" for name, value in options.items())
+            raise ValueError(f"an option is of the wrong type: {given} ({error})") from None
         return _length(length, PRESETS), batch or MapData.batch(shape), shape
 
     @staticmethod

@@ -173,7 +173,8 @@ class Trainer:
     # --- checkpoints ---
 
     def _facts(self) -> dict:
-        return {"plan": dataclasses.asdict(self.plan), **self.identity}
+        plan = {k: v for k, v in dataclasses.asdict(self.plan).items() if k != "checkpoint_seconds"}
+        return {"plan": plan, **self.identity}
 
     def _save(self, optimiser, parameters) -> None:
         tensors = {f"model.{name}": value for name, value in self.model.state_dict().items()}
