@@ -16,8 +16,9 @@ TABLES = ("table2", "figure8", "figure10", "options", "figure13")
 
 SETS = ("castle_white", "bishop_black", "knight_white", "chessboard", "boombox", "brick", "floor_tiles")
 
-PRESETS = ("BCf-0.5k", "BCf-1k", "BCf-2k", "BCf-2k++")
-"""Methods that are presets of the fit, with feature textures in proportion to the set (paper: for 2048²)."""
+PRESETS = ("BCf-0.5k", "BCf-1k", "BCf-2k", "BCf-2k++", "BCf-66%")
+"""Methods that are presets of the fit, with feature textures in proportion to the set (paper: for 2048²); the last one
+takes at most 0.66 times the bytes of BC at half resolution, about what the paper's 1k takes."""
 
 BASELINES = ("bc_half", "bc_full", "bc7_half", "bc7_full", "astc12_half", "astc12")
 
@@ -79,8 +80,12 @@ class Lab:
         from warp_neumat.training.fit import fit
 
         manifest, opened, _ = self.source(name)
+        named = preset.removeprefix("BCf-")
+        size = {"preset": named}
+        if named.endswith("%"):
+            size = {"bytes": self.baseline(name, "bc_half").bytes * int(named[:-1]) // 100}
         request = {
-            "preset": preset.removeprefix("BCf-"),
+            **size,
             "steps": self.choice.steps,
             "seed": self.choice.seed,
             **config,

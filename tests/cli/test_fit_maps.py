@@ -248,6 +248,7 @@ def test_a_broken_picture_is_one_line(run, maps, tmp_path, keep):
         (("--model", "neubrdf"), 1, "maps"),
         (("--model", "neubrdf", "--size", "8"), 2, "--size is for model bcf, not neubrdf"),
         (("--device", "abacus"), 1, "abacus"),
+        (("-o", "a.png"), 2, "-o must end in .neumat, got 'a.png'"),
     ],
 )
 def test_a_mistake_is_one_line_before_any_training(run, maps, tmp_path, arguments, code, message):
@@ -257,6 +258,11 @@ def test_a_mistake_is_one_line_before_any_training(run, maps, tmp_path, argument
     assert len(stderr.splitlines()) == 1
     assert stderr.startswith("neumat: ")
     assert not list(tmp_path.glob("a.neumat*"))
+
+
+def test_a_missing_folder_is_named_as_one(run, tmp_path):
+    code, _, stderr = run("fit", tmp_path / "none", "-o", tmp_path / "a.neumat")
+    assert (code, stderr) == (1, f"neumat: {tmp_path / 'none'}: no such folder or manifest\n")
 
 
 # --- interruptions ----------------------------------------------------------------------------------------------------
@@ -284,6 +290,20 @@ def test_a_killed_fit_resumes_to_the_same_file(run, maps, tmp_path):
     assert run("fit", maps, "-o", cut, *plan, "--resume")[0] == 0
     assert cut.read_bytes() == whole.read_bytes()
     assert not checkpoint.exists()
+
+
+def test_ctrl_c_says_interrupted(run, maps, tmp_path, monkeypatch):
+    def stop(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("warp_neumat.training.fit.fit", stop)
+    code, _, stderr = run("fit", maps, "-o", tmp_path / "a.neumat")
+    assert (code, stderr) == (130, "neumat: interrupted\n")
+
+
+def test_nothing_to_resume_is_said(fit):
+    _, stdout = fit("--resume")
+    assert "a.neumat.checkpoint: no such checkpoint to resume; starting anew" in stdout
 
 
 def test_a_resumed_fit_refuses_other_settings(run, maps, tmp_path, monkeypatch):

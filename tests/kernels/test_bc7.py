@@ -70,12 +70,6 @@ def test_tables_are_whole():
         assert two >> b & 1
 
 
-def test_partitions_begin_as_those_of_bc6h():
-    bc6h = pytest.importorskip("warp_neumat.kernels.bc6h_tables")
-    assert [int(p) for p in bc6h.PARTITIONS] == list(bc7_tables.PARTITIONS_2[:32])
-    assert [int(a) for a in bc6h.ANCHOR] == list(bc7_tables.ANCHORS_2[:32])
-
-
 def test_kinds_and_refusals(rng):
     check_kinds(bc7.bc7_decode, rng.integers(0, 256, (700, 16), dtype=np.uint8), (4, 4, 4))
 

@@ -1,5 +1,6 @@
 """The model in plain torch: Eq. 9 against real half floats, gradients against differences, blocks out and in again."""
 
+import types
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,15 @@ from warp_neumat.kernels.bc6h import bc6h_decode  # noqa: E402
 from warp_neumat.kernels.bc6h_encode import bc6h_encode  # noqa: E402
 from warp_neumat.kernels.bc6h_tables import PARTITIONS  # noqa: E402
 from warp_neumat.materials.bcf import BCf as Material  # noqa: E402
-from warp_neumat.models.bcf import BCf, BCfConfig, configure, decode_reference, feature_sizes, reference_loss  # noqa: E402
+from warp_neumat.models.bcf import (  # noqa: E402
+    BCf,
+    BCfConfig,
+    configure,
+    decode_reference,
+    feature_sizes,
+    reference_loss,
+    sizes_for_bytes,
+)
 
 CHANNEL = {"map": "roughness", "component": "value", "encoding": "linear", "range": [0.0, 1.0]}
 
@@ -197,3 +206,29 @@ def test_unknown_options_and_presets_are_named():
         feature_sizes(8, 8, "3k")
     with pytest.raises(ValueError, match="features must be whole numbers above 0"):
         feature_sizes(8, 8, (16.0, 8))
+
+
+@pytest.mark.parametrize("size", [(512, 512), (2048, 1024), (100, 37)])
+@pytest.mark.parametrize("budget", [3000, 40_000, 115_378])
+def test_a_budget_of_bytes_is_used_and_kept(size, budget):
+    rest = {"channels": 7, "hidden": 16, "smallest_mip": 1}
+    sizes = sizes_for_bytes(*size, budget, **rest)
+    channels = tuple({"map": f"m{n}", "component": "value"} for n in range(7))
+    tensors, _ = BCf(BCfConfig(sizes, *size, channels, {}), np.zeros(7)).to_asset(np.zeros((1 << 20, 16), np.uint8))
+    taken = sum(tensor.nbytes for tensor in tensors.values())
+    assert 0.8 * budget < taken <= budget
+    assert [max(s) for s in sizes] == sorted((max(s) for s in sizes), reverse=True)
+    with pytest.raises(ValueError, match="bytes must be at least"):
+        sizes_for_bytes(*size, 700, **rest)
+
+
+def test_sizes_are_given_in_one_way():
+    class Source:
+        name, width, height, constants = "s", 64, 64, {}
+        channels = (types.SimpleNamespace(map="m", component="value", encoding="linear", range=(0.0, 1.0)),)
+
+    assert configure(Source, {"bytes": 3000}).features[0][0] > configure(Source, {"bytes": 2000}).features[0][0]
+    with pytest.raises(ValueError, match="give a preset, features or bytes, not two of them"):
+        configure(Source, {"bytes": 3000}, "1k")
+    with pytest.raises(ValueError, match="bytes must be a whole number above 0, got '3k'"):
+        configure(Source, {"bytes": "3k"})

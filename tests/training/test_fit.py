@@ -67,7 +67,8 @@ def test_same_seed_same_tensors_other_seed_others():
 def test_the_model_follows_the_source(tmp_path):
     assert default_model(tmp_path) == default_model(str(tmp_path)) == "bcf"
     assert default_model({"maps": {}}) == default_model("set.JSON") == "bcf"
-    assert default_model(SOURCE) == default_model("brdfs.npz:gold") == "neubrdf"
+    assert default_model(SOURCE) == default_model("brdfs.npz:gold") == default_model("brdfs.npz") == "neubrdf"
+    assert default_model(tmp_path / "missing") == "bcf"
     assert presets("neubrdf") == ("quick", "standard", "fine")
     assert presets("bcf")[:4] == ("0.5k", "1k", "2k", "2k++")
 

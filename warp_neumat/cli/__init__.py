@@ -14,6 +14,8 @@ def main(arguments: list[str] | None = None) -> None:
     debug = "--debug" in arguments  # before or after the command
     try:
         code = app([a for a in arguments if a != "--debug"] if debug else arguments, standalone_mode=False)
+        if code == 130:  # the parser's word for Ctrl-C
+            raise KeyboardInterrupt
         if code:
             sys.exit(code)
     except Exception as error:

@@ -22,7 +22,7 @@ from warp_neumat.cli.values import (
 
 Asset = Annotated[Path, typer.Argument(help="A .neumat file.")]
 
-_OWN = ("model", "preset", "features", "steps", "seed", "resume", "size", "crop", "overrides", "device")
+_OWN = ("model", "preset", "features", "bytes", "steps", "seed", "resume", "size", "crop", "overrides", "device")
 
 
 @app.command()
@@ -48,6 +48,9 @@ def fit(
     features: Annotated[
         str | None,
         typer.Option(help="Longer sides of the feature textures instead of a preset, as 256,128,64,32 [texel]."),
+    ] = None,
+    budget: Annotated[
+        int | None, typer.Option("--bytes", min=1, help="Sizes of the feature textures by what they may take [byte].")
     ] = None,
     steps: Annotated[int | None, typer.Option(help="Training steps; default: the model's and the preset's.")] = None,
     seed: Annotated[int, typer.Option(help="Same seed, same file.")] = 0,
@@ -78,12 +81,15 @@ def fit(
     neumat fit bricks/ -o bricks.neumat --crop 0,0,512,512 --override normal.orientation=dx
     neumat fit FILE.npz:alum-bronze -o bronze.neumat
     """
+    if out.suffix.lower() != ".neumat":
+        raise Usage(f"-o must end in .neumat, got {str(out)!r}")
     config = parse_options(option or [], _OWN)
     opening = {
         "size": None if size is None else parse_set_size(size),
         "crop": None if crop is None else parse_crop(crop),
         "overrides": parse_overrides(override or []) or None,
         "features": None if features is None else parse_features(features),
+        "bytes": budget,
     }
     config |= {name: value for name, value in opening.items() if value is not None}
     # Threads of torch that spin while they wait cost a busy machine many times what they gain.
@@ -128,7 +134,11 @@ def evaluate(
     against: Annotated[str, typer.Option(help="The source, as for fit; a bcf remembers its size, crop and overrides.")],
     json_file: Annotated[str | None, typer.Option("--json", help="JSON to this file; - for standard output.")] = None,
     picture: Annotated[
-        Path | None, typer.Option(help="Write source, asset and ten times their difference side by side to this PNG.")
+        Path | None,
+        typer.Option(
+            help="Write source, asset and ten times their difference side by side to this PNG, then for a bcf with "
+            "baselines BC at half resolution and its difference; a row a map."
+        ),
     ] = None,
     baselines: Annotated[
         str | None,

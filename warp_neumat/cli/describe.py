@@ -8,8 +8,9 @@ def describe(header: dict, tensors: dict) -> list[str]:
     lines = _maps(header.get("config", {}), tensors) if header["kind"] == "bcf" else _fields(header, "config")
     for part in ("source", "training", "metrics"):
         lines += _fields(header, part)
-    for name, note in header.get("maps", {}).get("files", {}).items():
-        lines.append(f"  maps.{name}: {note}")
+    for name, file in header.get("maps", {}).get("files", {}).items():
+        lines.append(f"  maps.{name}: {file}")
+    lines += [f"  note: {note}" for note in header.get("maps", {}).get("notes", [])]
     if header["kind"] != "bcf":
         lines += [f"  {name}: {t['dtype']} {t['shape']}, {t['bytes']} bytes" for name, t in tensors.items()]
     return lines
@@ -20,6 +21,7 @@ def _fields(header: dict, part: str) -> list[str]:
     return [
         f"  {part}.{key}: {value:.6g}" if isinstance(value, float) else f"  {part}.{key}: {value}"
         for key, value in found
+        if value is not None
     ]
 
 

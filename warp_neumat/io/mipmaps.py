@@ -18,6 +18,8 @@ import math
 
 import numpy as np
 
+from warp_neumat.io.block_formats import mip_limit, mip_size
+
 _ROWS = 128  # rows of a power at a time, so that the temporaries stay in cache
 
 
@@ -131,7 +133,7 @@ def mip_chain(pixels: np.ndarray, channels, *, toksvig_roughness: bool = False) 
 
 def mip_sizes(width: int, height: int) -> list[tuple[int, int]]:
     """Return (width, height) of every mip level from the full size to 1×1, halved with floor."""
-    return [(max(1, width >> m), max(1, height >> m)) for m in range(max(width, height).bit_length())]
+    return [mip_size(width, height, mip) for mip in range(mip_limit(width, height))]
 
 
 def toksvig(roughness: np.ndarray, length: np.ndarray) -> np.ndarray:

@@ -8,6 +8,8 @@ import dataclasses
 
 import numpy as np
 
+from warp_neumat.kernels.bc6h_tables import ANCHOR, PARTITIONS, WEIGHTS3, WEIGHTS4
+
 
 @dataclasses.dataclass(frozen=True)
 class Mode:
@@ -63,26 +65,22 @@ MODES = (
 
 WEIGHTS = {
     2: (0, 21, 43, 64),
-    3: (0, 9, 18, 27, 37, 46, 55, 64),
-    4: (0, 4, 9, 13, 17, 21, 26, 30, 34, 38, 43, 47, 51, 55, 60, 64),
+    3: tuple(WEIGHTS3.tolist()),
+    4: tuple(WEIGHTS4.tolist()),
 }
 """Bits of an index → share of the second endpoint in 64ths. In one formula: 64·index / (2^bits − 1), rounded."""
 
 PARTITIONS_2 = (
-    0xCCCC, 0x8888, 0xEEEE, 0xECC8, 0xC880, 0xFEEC, 0xFEC8, 0xEC80,
-    0xC800, 0xFFEC, 0xFE80, 0xE800, 0xFFE8, 0xFF00, 0xFFF0, 0xF000,
-    0xF710, 0x008E, 0x7100, 0x08CE, 0x008C, 0x7310, 0x3100, 0x8CCE,
-    0x088C, 0x3110, 0x6666, 0x366C, 0x17E8, 0x0FF0, 0x718E, 0x399C,
+    *PARTITIONS.tolist(),
     0xAAAA, 0xF0F0, 0x5A5A, 0x33CC, 0x3C3C, 0x55AA, 0x9696, 0xA55A,
     0x73CE, 0x13C8, 0x324C, 0x3BDC, 0x6996, 0xC33C, 0x9966, 0x0660,
     0x0272, 0x04E4, 0x4E40, 0x2720, 0xC936, 0x936C, 0x39C6, 0x639C,
     0x9336, 0x9CC6, 0x817E, 0xE718, 0xCCF0, 0x0FCC, 0x7744, 0xEE22,
 )  # fmt: skip
-"""Bit t set: texel t lies in subset 1."""
+"""Bit t set: texel t lies in subset 1. The first 32 are BC6H's."""
 
 ANCHORS_2 = (
-    15, 15, 15, 15, 15, 15, 15, 15, 15, 15, 15, 15, 15, 15, 15, 15,
-    15, 2, 8, 2, 2, 8, 8, 15, 2, 8, 2, 2, 8, 8, 2, 2,
+    *ANCHOR.tolist(),
     15, 15, 6, 8, 2, 8, 15, 15, 2, 8, 2, 2, 2, 15, 15, 6,
     6, 2, 6, 8, 15, 15, 2, 2, 15, 15, 15, 15, 15, 2, 2, 15,
 )  # fmt: skip

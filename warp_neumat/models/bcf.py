@@ -163,12 +163,39 @@ def feature_sizes(width: int, height: int, features) -> tuple[tuple[int, int], .
     return tuple((blocks(side * width / longest), blocks(side * height / longest)) for side in features)
 
 
+def sizes_for_bytes(width: int, height: int, budget: int, *, channels: int, hidden: int, smallest_mip: int):
+    """Return the largest feature textures in the proportions of preset ``1k`` that fit, with the network, into bytes.
+
+    Raises: ValueError: If not even the smallest fit; names the least that does.
+    """
+    longest, network = max(width, height), 2 * StepShape(len(PRESETS["1k"]), hidden, channels).weights
+
+    def total(sizes) -> int:
+        chains = (mip_sizes(*size) for size in sizes)
+        return network + sum(
+            stored_texels(mip) for mips in chains for n, mip in enumerate(mips) if n == 0 or max(mip) >= smallest_mip
+        )
+
+    best = None
+    for side in range(4, 4 * longest + 1, 4):
+        fractions = (fraction / PRESETS["1k"][0] for fraction in PRESETS["1k"])
+        sizes = feature_sizes(width, height, tuple(max(4, 4 * round(side * f / 4)) for f in fractions))
+        if total(sizes) > budget:
+            if best is None:
+                raise ValueError(f"bytes must be at least {total(sizes)} for {width}x{height}, got {budget}")
+            break
+        best = sizes
+    return best
+
+
 def configure(source, options: dict, preset: str | None = None) -> BCfConfig:
-    """Return the configuration for a texture set; ``options`` are fields of :class:`BCfConfig`.
+    """Return the configuration for a texture set; ``options`` are fields of :class:`BCfConfig`, or ``bytes``.
+
+    ``features`` may be as :func:`feature_sizes` takes them; ``bytes`` is what the asset's tensors may take at most.
 
     Raises: ValueError: If an option is unknown or out of range, or the set has no channel to learn.
     """
-    known = {f.name for f in dataclasses.fields(BCfConfig)} - {"width", "height", "channels", "constants"}
+    known = {f.name for f in dataclasses.fields(BCfConfig)} - {"width", "height", "channels", "constants"} | {"bytes"}
     for name in options:
         if name not in known:
             close = difflib.get_close_matches(name, known, n=1, cutoff=0.0)[0]
@@ -176,9 +203,16 @@ def configure(source, options: dict, preset: str | None = None) -> BCfConfig:
     if not source.channels:
         raise ValueError(f"{source.name}: every map is constant, so there is nothing to learn; a renderer can use them")
     options = dict(options)
-    if preset is not None and "features" in options:
-        raise ValueError("give either a preset or features, not both")
-    sizes = feature_sizes(source.width, source.height, options.pop("features", preset or "1k"))
+    if (preset is not None) + ("features" in options) + ("bytes" in options) > 1:
+        raise ValueError("give a preset, features or bytes, not two of them")
+    if "bytes" in options:
+        shape = {name: options.get(name, getattr(BCfConfig, name)) for name in ("hidden", "smallest_mip")}
+        budget = options.pop("bytes")
+        if isinstance(budget, bool) or not isinstance(budget, int) or budget < 1:
+            raise ValueError(f"bytes must be a whole number above 0, got {budget!r}")
+        sizes = sizes_for_bytes(source.width, source.height, budget, channels=len(source.channels), **shape)
+    else:
+        sizes = feature_sizes(source.width, source.height, options.pop("features", preset or "1k"))
     if "feature_range" in options:
         options["feature_range"] = tuple(float(v) for v in options["feature_range"])
     channels = tuple(

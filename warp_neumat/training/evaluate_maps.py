@@ -18,6 +18,7 @@ import math
 import numpy as np
 
 from warp_neumat import metrics
+from warp_neumat.io.mipmaps import unit_normals
 from warp_neumat.training.baselines import METHODS, THOROUGH, Baseline
 
 _CHUNK = 1 << 18  # samples that are evaluated at a time: 2K maps are never in memory as coordinates
@@ -50,10 +51,7 @@ class MapChannels:
     def normals(self, encoded: np.ndarray) -> np.ndarray:
         """Return unit normals (..., 3) of encoded x and y (..., 2)."""
         low, high = np.asarray(self.ranges, np.float32).T
-        xy = 2.0 * (low + (high - low) * encoded) - 1.0
-        z = np.sqrt(np.maximum(0.0, 1.0 - (xy * xy).sum(axis=-1, keepdims=True)))
-        vector = np.concatenate([xy, z], axis=-1)
-        return vector / np.linalg.norm(vector, axis=-1, keepdims=True)
+        return unit_normals(low + (high - low) * encoded)
 
     def picture(self, encoded: np.ndarray) -> np.ndarray:
         """Return the map as an eye looks at it, (h, w, 3) in [0, 1]."""
@@ -150,7 +148,7 @@ def map_metrics(texture_set, encoded_fn, *, mips: int | None = None, progress=No
 
     Args:
         texture_set: The source, as :func:`warp_neumat.io.texture_set.open_texture_set` opens it.
-        encoded_fn: ``(uv (n, 2), lod) -> (n, C)`` as :meth:`MaterialBCF.encoded`, lod = mip of the source.
+        encoded_fn: ``(uv (n, 2), lod) -> (n, C)`` as ``BCf.encoded`` of ``materials/bcf.py``, lod = mip of the source.
         mips: How many mips to compare, from the finest on; default: all, to 1×1.
         progress: ``progress(fraction, text)``.
     """

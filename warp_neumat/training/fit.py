@@ -138,10 +138,10 @@ DATA = {"brdf": BRDFData, "maps": MapData}
 
 
 def default_model(source) -> str:
-    """Return the model that a source is for: ``bcf`` where it is a folder or a manifest, else ``neubrdf``."""
+    """Return the model that a source is for: ``neubrdf`` for ``FILE.npz…`` and ``KIND:…``, else ``bcf``."""
     if isinstance(source, dict) or str(source).lower().endswith(".json") or os.path.isdir(source):
         return "bcf"
-    return "neubrdf"
+    return "neubrdf" if ":" in str(source) or str(source).lower().endswith(".npz") else "bcf"
 
 
 def presets(model: str) -> tuple[str, ...]:
@@ -185,7 +185,8 @@ def fit(
         preset: One of :data:`PRESETS`; for ``bcf`` also one of :data:`warp_neumat.models.bcf.PRESETS`.
         resume: Go on from the checkpoint beside ``out`` where there is one.
         progress: ``progress(fraction, text)``.
-        announce: ``announce(text)``, called once before the training with what was understood of a texture set.
+        announce: ``announce(text)``, called before the training with what was understood of a texture set, and where
+            there was nothing to resume.
         budget_seconds: Train for this time instead of ``steps``; then the tensors depend on the machine's speed.
         checkpoint_seconds: Longest stretch of work that an interruption can cost.
         config: Fields of the model's config, as ``nside=32`` or ``features=(256, 128, 64, 32)``; for ``bcf`` also
@@ -220,8 +221,8 @@ def fit(
         identity = {"source": _named(source), "opening": settled, "model": model, "config": repr(shape)}
         more = {"checkpoint": checkpoint_path(out), "identity": identity, "progress": progress}
         trainer = kind.trainer(module, opened, shape, plan, _device(device), **more)
-        if resume and not trainer.resume() and progress:
-            progress(0.0, "no checkpoint to resume: starting anew")
+        if resume and not trainer.resume() and announce:
+            announce(f"note: {checkpoint_path(out)}: no such checkpoint to resume; starting anew")
         facts = trainer.run()
         tensors, header, metrics = kind.stored(module, opened, trainer)
         size = sum(tensor.nbytes for tensor in tensors.values())

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from warp_neumat.io.mipmaps import linear_to_srgb
+
 LIGHTS = (
     ((-0.5, 0.5, 0.70710678), (np.pi, np.pi, np.pi)),  # key, 45° from the view: a white Lambertian facing it shows 1
     ((0.8, -0.1, 0.59160798), (0.6, 0.6, 0.6)),  # fill, 54° on the other side
@@ -49,10 +51,7 @@ def render_sphere(eval_fn, size: int = 256, lights=LIGHTS) -> np.ndarray:
 
 def tone_map(image: np.ndarray) -> np.ndarray:
     """Return ``image`` as shown: clipped to [0, 1] and sRGB-encoded (IEC 61966-2-1)."""
-    x = np.clip(image, 0.0, 1.0)
-    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.power(np.maximum(x, 1e-9), 1 / 2.4) - 0.055).astype(
-        np.float32
-    )
+    return linear_to_srgb(np.clip(image, 0.0, 1.0))
 
 
 def sphere_error(image: np.ndarray, reference: np.ndarray) -> dict[str, float]:
