@@ -154,6 +154,17 @@ def test_info_shows_textures_network_and_channels(run, asset):
     assert record["tensors"]["texture0.mip0"] == {"dtype": "uint8", "shape": [4, 4, 16], "bytes": 256}
 
 
+def test_info_repeats_the_notes_of_the_fit(run, asset):
+    tensors, header = read_asset(asset)
+    header["maps"] = {"files": {"normal": "n.png"}, "notes": ["normal: orientation not named"]}
+    header["training"] = {"steps": 5, "budget_seconds": None}
+    write_asset(asset, tensors, header)
+    lines = run("info", asset)[1].splitlines()
+    assert lines[-2:] == ["  maps.normal: n.png", "  note: normal: orientation not named"]
+    assert "  training.steps: 5" in lines
+    assert not any("budget_seconds" in line for line in lines)
+
+
 # --- decode -----------------------------------------------------------------------------------------------------------
 
 

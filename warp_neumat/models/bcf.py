@@ -198,8 +198,9 @@ def configure(source, options: dict, preset: str | None = None) -> BCfConfig:
     known = {f.name for f in dataclasses.fields(BCfConfig)} - {"width", "height", "channels", "constants"} | {"bytes"}
     for name in options:
         if name not in known:
-            close = difflib.get_close_matches(name, known, n=1, cutoff=0.0)[0]
-            raise ValueError(f"no option {name!r} of bcf; nearest: {close}")
+            close = difflib.get_close_matches(name, known, n=1)
+            nearest = f"nearest: {close[0]}; " if close else ""
+            raise ValueError(f"no option {name!r} of bcf; {nearest}known: {', '.join(sorted(known))}")
     if not source.channels:
         raise ValueError(f"{source.name}: every map is constant, so there is nothing to learn; a renderer can use them")
     options = dict(options)
