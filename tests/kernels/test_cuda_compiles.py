@@ -1,12 +1,15 @@
-"""The kernels of the render path compile to PTX, which needs no GPU: one source serves both kinds of device."""
+"""The kernels of rendering and of BCf training compile to PTX, without a GPU: one source serves both devices."""
 
 import pytest
 import warp as wp
 
 from warp_neumat.kernels import (
     atlas,
+    bc6h_encode_pack,
     bcf,
     bcf_shade,
+    bcf_train,
+    block_texture,
     frame,
     gather,
     ggx,
@@ -46,6 +49,10 @@ def _shade_textured():
     return shade.make_shade_kernel(bcf_shade.functions, layout, 1, textured=True).module
 
 
+def _bcf_step():
+    return bcf_train.step_kernel(bcf_train.StepShape(textures=4, hidden=16, channels=9), 1).module
+
+
 MODULES = {
     "frame": _frame,
     "healpix": _healpix,
@@ -55,6 +62,10 @@ MODULES = {
     "shade_textured": _shade_textured,
     "ggx": lambda: ggx._make_kernel(1).module,
     "lod": lambda: lod.uv_gradient_kernel.module,
+    "bcf_step": _bcf_step,
+    "block_decode": lambda: block_texture.make_block_kernels()[0].module,
+    "block_adjoint": lambda: block_texture.make_block_kernels()[1].module,
+    "bc6h_pack": lambda: bc6h_encode_pack.bc6h_pack_kernel.module,
     "worklist": lambda: worklist.list_kernel.module,
     "gather": lambda: gather.gather_kernel.module,
     "atlas": lambda: wp.get_module(atlas.__name__),

@@ -6,9 +6,11 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from warp_neumat.io.mipmaps import mip_sizes  # noqa: E402
+from warp_neumat.kernels import dispatch  # noqa: E402
 from warp_neumat.kernels.patches import draw_patches, pad_reference  # noqa: E402
 from warp_neumat.models.bcf import BCf, BCfConfig, _images, _trilinear, reference_loss  # noqa: E402
 from warp_neumat.ops import Step, bcf_loss  # noqa: E402
+from warp_neumat.ops import bcf as bcf_ops  # noqa: E402
 from warp_neumat.ops.bcf import _sizes  # noqa: E402
 
 SQUARE = {"size": (64, 64), "features": ((32, 32), (16, 16), (8, 8), (4, 4))}
@@ -225,3 +227,25 @@ def test_wrong_arguments_of_a_step_are_named(rng):
         problem.step(1, torch.ones(2))
     with pytest.raises(ValueError, match="patches must"):
         problem.step(1).run(problem.patches[1:], 0)
+
+
+@pytest.mark.parametrize("probe", [False, True])
+@pytest.mark.parametrize("case", [{**SQUARE}, {**ODD, "wrap": "clamp"}], ids=["square", "odd"])
+def test_the_cuda_step_equals_the_cpu_step(rng, monkeypatch, case, probe):
+    """CUDA's source, one sample a thread, compiled for the CPU and run on one worker, where its additions are safe."""
+    problem = Problem(rng, **case)
+    weight = torch.from_numpy(rng.uniform(0.5, 2.0, problem.shape.channels).astype(np.float32))
+    expected = problem.step(channel_weight=weight)
+    expected.run(problem.patches, 41, probe=probe)
+    monkeypatch.setattr(bcf_ops, "lanes", lambda device: 1)
+    with pytest.raises(ValueError, match="parts must be 1 on cpu"):
+        problem.step(parts=2)
+    scalar = problem.step(channel_weight=weight)
+    dispatch.set_worker_count(1)
+    try:
+        scalar.run(problem.patches, 41, probe=probe)
+    finally:
+        dispatch.set_worker_count(None)
+    for name in ("texel_gradient", "weight_gradient", "losses", "samples"):
+        mine, wanted = getattr(scalar, name), getattr(expected, name)
+        assert (mine - wanted).abs().max() <= 1e-5 * wanted.abs().max(), name
