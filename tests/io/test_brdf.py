@@ -5,7 +5,8 @@ import shutil
 import numpy as np
 import pytest
 
-from warp_neumat.io.brdf import open_brdf, rusinkiewicz
+from warp_neumat.io.brdf import NetworkBRDF, open_brdf, rusinkiewicz
+from warp_neumat.io.brdf_source import CHUNK, from_half_difference
 
 
 def directions(rng, count):
@@ -47,12 +48,24 @@ def test_rusinkiewicz_matches_rotation_matrices(pair):
             np.testing.assert_allclose(row, [np.sin(theta), 0, np.cos(theta), *(back @ i)], atol=1e-7)
 
 
+def test_half_and_difference_angles_go_there_and_back(rng):
+    theta_h, theta_d, phi_d = rng.random((3, 500)) * np.array([[1.5], [1.5], [2 * np.pi]])
+    h, d = np.split(rusinkiewicz(*from_half_difference(theta_h, theta_d, phi_d)), 2, axis=1)
+    np.testing.assert_allclose(h, np.stack([np.sin(theta_h), 0 * theta_h, np.cos(theta_h)], 1), atol=1e-12)
+    sine = np.sin(theta_d)
+    np.testing.assert_allclose(
+        d, np.stack([sine * np.cos(phi_d), sine * np.sin(phi_d), np.cos(theta_d)], 1), atol=1e-12
+    )
+
+
 @pytest.mark.parametrize("name", ["alum-bronze", "black-fabric", "chrome"])
 def test_network_matches_float64(merl, pair, name):
     wi, wo = pair
     source = open_brdf(f"{merl}:{name}")
     assert source.name == name
     assert source.isotropic
+    assert source.symmetry == "none"
+    assert source.notes == ()
     with np.load(merl) as archive:
         w = {k: archive[f"{name}/{k}"].astype(np.float64) for k in ("w0", "b0", "w1", "b1", "w2", "b2")}
     x = rusinkiewicz(wi.astype(np.float64), wo.astype(np.float64))
@@ -63,6 +76,27 @@ def test_network_matches_float64(merl, pair, name):
     assert got.shape == (4000, 3)
     # Worst seen 2e-6 (chrome); x 3.
     assert (np.abs(got - expected) / (1 + expected)).max() < 6e-6
+
+
+def test_network_does_not_depend_on_how_it_is_cut(merl, rng):
+    # More than one chunk, the last of which is neither whole nor a whole number of blocks.
+    wi, wo = directions(rng, 2 * CHUNK + 1234), directions(rng, 2 * CHUNK + 1234)
+    source = open_brdf(f"{merl}:nickel")
+    whole = source.eval(wi, wo)
+    for part in (slice(0, 1), slice(CHUNK - 3, CHUNK + 700), slice(-800, None)):
+        np.testing.assert_allclose(source.eval(wi[part], wo[part]), whole[part], rtol=2e-5, atol=2e-6)
+    assert source.eval(wi[:0], wo[:0]).shape == (0, 3)
+
+
+def test_network_survives_any_pair(merl):
+    up, flat = np.float32([0, 0, 1]), np.float32([1, 0, 0])
+    odd = np.float32([up, flat, -up, -flat, [1e-30, 0, 1], [1, 0, 1e-38], [0, 0, 0], [np.nan] * 3, [np.inf, 0, 1]])
+    wi, wo = np.repeat(odd, len(odd), 0), np.tile(odd, (len(odd), 1))
+    value = open_brdf(f"{merl}:chrome").eval(wi, wo)
+    usable = np.isfinite(wi).all(1) & np.isfinite(wo).all(1)
+    assert np.isfinite(value[usable]).all()
+    assert (value[usable] >= 0).all()
+    assert (value[~((wi[:, 2] > 0) & (wo[:, 2] > 0))] == 0).all()
 
 
 def test_network_is_isotropic(merl, pair):
@@ -95,83 +129,39 @@ def test_wrong_names_are_explained(merl, tmp_path):
         open_brdf(f"{tmp_path}/bad.npz:x")
 
 
-def ggx(wi, wo, ax, ay, f0, diffuse):
-    """The textbook form, in float64: angles and tangents."""
-    h = wi + wo
-    h /= np.linalg.norm(h, axis=1, keepdims=True)
-    d = 1 / (np.pi * ax * ay * ((h[:, 0] / ax) ** 2 + (h[:, 1] / ay) ** 2 + h[:, 2] ** 2) ** 2)
-
-    def smith_lambda(w):
-        return 0.5 * (np.sqrt(1 + ((ax * w[:, 0]) ** 2 + (ay * w[:, 1]) ** 2) / w[:, 2] ** 2) - 1)
-
-    g = 1 / (1 + smith_lambda(wi) + smith_lambda(wo))
-    f = f0 + (1 - f0) * (1 - (wi * h).sum(1, keepdims=True)) ** 5
-    return f * (d * g / (4 * wi[:, 2] * wo[:, 2]))[:, None] + np.asarray(diffuse) / np.pi
-
-
-def test_ggx_matches_the_textbook(pair):
-    wi, wo = pair
-    source = open_brdf("analytic:ggx?roughness=0.4&f0=0.9,0.6,0.3&diffuse=0.1&anisotropy=0.5")
-    assert not source.isotropic
-    aspect = np.sqrt(1 - 0.9 * 0.5)
-    unit = [d.astype(np.float64) / np.linalg.norm(d.astype(np.float64), axis=1, keepdims=True) for d in pair]
-    expected = ggx(*unit, 0.16 / aspect, 0.16 * aspect, np.array([0.9, 0.6, 0.3]), [0.1, 0.1, 0.1])
-    np.testing.assert_allclose(source.eval(wi, wo), expected, rtol=4e-6)  # worst seen 1.3e-6; x 3
-
-
-@pytest.mark.parametrize(
-    "spec",
-    ["ggx?roughness=0.15&f0=0.9,0.6,0.3", "ggx?roughness=0.5&anisotropy=0.8&ior=1.5", "lambert?albedo=0.2,0.5,1"],
-)
-def test_analytic_sources_are_reciprocal(pair, spec):
-    wi, wo = pair
-    source = open_brdf(f"analytic:{spec}")
-    np.testing.assert_allclose(source.eval(wi, wo), source.eval(wo, wi), rtol=6e-6)  # worst seen 2e-6; x 3
-
-
-def test_ggx_albedo_is_known_at_full_roughness(rng):
-    # At alpha = 1, D = 1/π and G₂ = 2z/(1 + z) for a view along the normal, so the albedo is ∫ z/(1 + z) dz = 1 − ln 2.
-    z, phi = rng.random((2, 400_000)) * [[1], [2 * np.pi]]
-    wi = np.stack([np.sqrt(1 - z * z) * np.cos(phi), np.sqrt(1 - z * z) * np.sin(phi), z], 1)
-    wo = np.broadcast_to(np.float32([0, 0, 1]), wi.shape)
-    value = open_brdf("analytic:ggx?roughness=1&f0=1").eval(wi, wo)
-    np.testing.assert_allclose((value * z[:, None]).mean(0) * 2 * np.pi, 1 - np.log(2), rtol=5e-3)
-
-
-def test_below_the_horizon_is_zero():
-    up, down = np.float32([[0, 0.6, 0.8]]), np.float32([[0, 0.6, -0.8]])
-    for spec in ("analytic:ggx?diffuse=1", "analytic:lambert"):
-        source = open_brdf(spec)
-        assert (source.eval(up, up) > 0).all()
-        for wi, wo in ((up, down), (down, up), (down, down)):
-            assert (source.eval(wi, wo) == 0).all()
-
-
-def test_ior_sets_f0(pair):
-    wi, wo = pair
-    a = open_brdf("analytic:ggx?ior=1.5").eval(wi, wo)
-    np.testing.assert_allclose(a, open_brdf("analytic:ggx?f0=0.04").eval(wi, wo), rtol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("spec", "message"),
-    [
-        ("ggx?roughnes=0.2", "no parameter 'roughnes'; nearest: roughness"),
-        ("gxx?roughness=0.2", "no analytic model 'gxx'; nearest: ggx"),
-        ("ggx?roughness=2", r"roughness must be one number in \[0.01, 1.0\], got '2'"),
-        ("ggx?roughness=0.1,0.2", "roughness must be one number"),
-        ("ggx?f0=1,2,x", "f0 must be one number or R,G,B"),
-        ("ggx?f0=nan", "f0 must be"),
-        ("lambert?albedo=0.5&albedo=0.6", "'albedo' must be given once"),
-    ],
-)
-def test_wrong_parameters_are_explained(spec, message):
-    with pytest.raises(ValueError, match=message):
-        open_brdf(f"analytic:{spec}")
-
-
 def test_wrong_specs_and_shapes_are_explained():
-    with pytest.raises(ValueError, match="is no BRDF source; use FILE.npz:NAME"):
-        open_brdf("bronze")
+    with pytest.raises(ValueError, match=r"'bronze.tif' is no BRDF source; use FILE.npz:NAME .*FILE.binary .*FILE.csv"):
+        open_brdf("bronze.tif")
     with pytest.raises(ValueError, match=r"wo must have shape \(N, 3\), got \(4,\)"):
         open_brdf("analytic:lambert").eval(np.ones((4, 3)), np.ones(4))
+
+
+@pytest.mark.parametrize("suffix", [".binary", ".bsdf", ".csv"])
+def test_missing_files_and_wrong_options_are_explained(tmp_path, suffix):
+    path = tmp_path / f"a{suffix}"
+    with pytest.raises(FileNotFoundError, match=rf"a{suffix}: no such file"):
+        open_brdf(str(path))
+    path.write_bytes(b"")
+    with pytest.raises(ValueError, match="no option 'colour' here; known: "):
+        open_brdf(f"{path}?colour=1")
+    with pytest.raises(ValueError, match=rf"a{suffix}: "):  # empty
+        open_brdf(str(path))
+
+
+def test_options_are_checked(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text("")
+    with pytest.raises(ValueError, match="'symmetry' must be given once, as symmetry=none|reciprocal|bilateral"):
+        open_brdf(f"{path}?symmetry=mirror")
+    with pytest.raises(ValueError, match="'isotropic' must be given once"):
+        open_brdf(f"{path}?isotropic=1&isotropic=1")
+
+
+def test_network_of_another_width(rng):
+    shapes = {"w0": (6, 9), "b0": (9,), "w1": (9, 9), "b1": (9,), "w2": (9, 3), "b2": (3,)}
+    w = {key: rng.normal(size=shape).astype(np.float32) for key, shape in shapes.items()}
+    wi, wo = directions(rng, 3000), directions(rng, 3000)
+    a = np.maximum(np.maximum(rusinkiewicz(wi, wo) @ w["w0"] + w["b0"], 0) @ w["w1"] + w["b1"], 0)
+    expected = np.maximum(np.expm1(a @ w["w2"] + w["b2"]), 0)
+    got = NetworkBRDF("x", w).eval(wi, wo)
+    assert (np.abs(got - expected) / (1 + expected)).max() < 2e-4  # float32 on both sides, exponents up to 30
