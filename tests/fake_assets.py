@@ -1,25 +1,57 @@
 """Assets with random contents, for tests of what a material computes rather than of how well it was fitted."""
 
+import zlib
+
 import numpy as np
 
-from warp_neumat.io.asset import pack_bits, write_asset
+from warp_neumat.io.asset import KINDS, pack_bits, write_asset
 from warp_neumat.kernels.bc6h_tables import MODES
 
 
-def random_neubrdf(rng, *, nside=8, features=8, bits=6, hidden=(64, 64), frame="isotropic"):
-    """Return (tensors, header) of a NeuBRDF whose values are of order one and vary with both directions."""
+def random_neubrdf(
+    rng,
+    *,
+    nside=8,
+    features=8,
+    bits=6,
+    hidden=(64, 64),
+    frame="isotropic",
+    symmetry="none",
+    interpolation="bilinear",
+    keep=None,
+    texture=None,
+):
+    """Return (tensors, header) of a NeuBRDF whose values are of order one and vary with both directions.
+
+    Args:
+        rng: Generator.
+        nside, features, bits, hidden, frame, symmetry, interpolation: As in the config.
+        keep: Share of the grid points that are live; None = all are, and there is no ``live``.
+        texture: (width, height, channels, mips) of a neural texture.
+    """
     points = 6 * nside * nside + 6 * nside + 1
-    widths = (2 * features, *hidden, 3)
-    tensors = {
-        "codebook": rng.normal(size=(2**bits, features)).astype(np.float16),
-        "indices": pack_bits(rng.integers(0, 2**bits, 2 * points), bits),
-    }
+    channels = texture[2] if texture else 0
+    widths = (2 * features + channels, *hidden, 3)
+    stored, tensors = 2 * points, {}
+    if keep is not None:
+        live = rng.random(2 * points) < keep
+        live[[0, points]] = True  # one of each side at least
+        stored = int(live.sum())
+        bytes_ = zlib.compress(np.packbits(live, bitorder="little").tobytes())
+        tensors["live"] = np.frombuffer(bytes_, np.uint8)
+    tensors["codebook"] = rng.normal(size=(2**bits, features)).astype(np.float16)
+    tensors["indices"] = pack_bits(rng.integers(0, 2**bits, stored), bits)
     for n, (i, o) in enumerate(zip(widths[:-1], widths[1:], strict=True)):
         tensors[f"weight{n}"] = (rng.normal(size=(o, i)) * np.sqrt(1.5 / i)).astype(np.float16)
         tensors[f"bias{n}"] = np.full(o, 0.2, np.float16)
     config = {"nside": nside, "features": features, "bits": bits, "hidden": list(hidden), "frame": frame}
-    config |= {"interpolation": "bilinear", "output": "expm1"}
-    return tensors, {"kind": "neubrdf", "version": 1, "config": config}
+    config |= {"interpolation": interpolation, "symmetry": symmetry, "output": "expm1", "texture": None}
+    if texture:
+        config["texture"] = dict(zip(("width", "height", "channels", "mips"), texture, strict=True))
+        for m in range(texture[3]):
+            shape = (max(1, texture[1] >> m), max(1, texture[0] >> m), channels)
+            tensors[f"texture.mip{m}"] = rng.normal(size=shape).astype(np.float16)
+    return tensors, {"kind": "neubrdf", "version": KINDS["neubrdf"], "config": config}
 
 
 CHANNELS = [

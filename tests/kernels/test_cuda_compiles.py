@@ -37,11 +37,21 @@ def _mlp():
 
 
 def _neubrdf():
-    return neubrdf.make_eval_kernel(neubrdf.Layout((64, 64), True), 1).module
+    return neubrdf.make_eval_kernel(neubrdf.Layout((64, 64), "isotropic"), 1).module
+
+
+def _neubrdf_half():
+    layout = neubrdf.Layout((64, 32, 64), "half-isotropic", "bilateral", "idw", channels=9)
+    return neubrdf.make_eval_kernel(layout, 1).module
 
 
 def _shade():
-    return shade.make_shade_kernel(neubrdf.functions, neubrdf.Layout((64, 64), True), 1).module
+    return shade.make_shade_kernel(neubrdf.functions, neubrdf.Layout((64, 64), "isotropic"), 1).module
+
+
+def _shade_neubrdf_textured():
+    layout = neubrdf.Layout((32,), "half", "reciprocal", "uniform", channels=8)
+    return shade.make_shade_kernel(neubrdf.functions, layout, 1, textured=True).module
 
 
 def _shade_textured():
@@ -58,8 +68,10 @@ MODULES = {
     "healpix": _healpix,
     "mlp": _mlp,
     "neubrdf": _neubrdf,
+    "neubrdf_half": _neubrdf_half,
     "shade": _shade,
     "shade_textured": _shade_textured,
+    "shade_neubrdf_textured": _shade_neubrdf_textured,
     "ggx": lambda: ggx._make_kernel(1).module,
     "lod": lambda: lod.uv_gradient_kernel.module,
     "bcf_step": _bcf_step,

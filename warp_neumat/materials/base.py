@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from warp_neumat.io.asset import read_asset
+from warp_neumat.io.shared_asset import read_whole_asset
+from warp_neumat.materials import brdf_sampling
 
 KINDS = {"bcf": "warp_neumat.materials.bcf:BCf", "neubrdf": "warp_neumat.materials.neubrdf:NeuBRDF"}
 """Where the class of each kind lives: a kind that a scene does not use is never imported, so never compiled."""
@@ -30,6 +31,8 @@ class Material(abc.ABC):
     """The asset's JSON header: config, source, training facts, metrics."""
     bytes: int
     """Size of the asset's tensors in bytes, as stored."""
+    device: Any
+    """Warp device that it is on."""
 
     @abc.abstractmethod
     def eval(self, uv, wi, wo):
@@ -43,14 +46,31 @@ class Material(abc.ABC):
         Below-horizon pairs give 0; no input gives a NaN or a negative value.
         """
 
-    def brdf(self, wi, wo):
+    def brdf(self, wi, wo, uv=None):
         """Return the value without the cosine [1/sr] for numpy pairs of directions, shape [n, 3]; 0 below the horizon.
 
         Directions are normalised, as :meth:`eval` does it.
         """
         wi = np.asarray(wi, np.float32)
         cosine = wi[:, 2:] / np.maximum(np.linalg.norm(wi, axis=1, keepdims=True), np.float32(1e-30))
-        return self.eval(None, wi, wo) / np.where(cosine > 0, cosine, 1)
+        return self.eval(uv, wi, wo) / np.where(cosine > 0, cosine, 1)
+
+    def sample(self, uv, wo, u):
+        """Return (ω_i [n, 3], weight = value × cos θ_i / pdf [n, 3], pdf [n] in 1/sr) for a path tracer.
+
+        Args:
+            uv: Texture coordinates, shape [n, 2], or None.
+            wo: Directions to the viewer, shape [n, 3]; numpy, torch or Warp.
+            u: Random numbers in [0, 1), shape [n, 3].
+
+        Drawn from a mixture that is fitted to the material once, at the first call
+        (:mod:`warp_neumat.materials.brdf_sampling`). Where ω_i falls below the horizon, weight and pdf are 0.
+        """
+        return brdf_sampling.sample(self, uv, wo, u)
+
+    def pdf(self, uv, wi, wo):
+        """Return the density [1/sr] with which :meth:`sample` draws ``wi``, shape [n]; ``uv`` is ignored."""
+        return brdf_sampling.pdf(self, wi, wo)
 
     @abc.abstractmethod
     def shader(self) -> "Shader":
@@ -99,6 +119,6 @@ def load(path, *, device=None) -> Material:
         FileNotFoundError: If there is no such file.
         FormatError: If it is not an asset that this release reads; the message names file, field and rule.
     """
-    tensors, header = read_asset(path)
+    tensors, header = read_whole_asset(path)
     module, _, name = KINDS[header["kind"]].partition(":")
     return getattr(importlib.import_module(module), name)(tensors, header, path=Path(path), device=device)
