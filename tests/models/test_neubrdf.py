@@ -7,8 +7,10 @@ torch = pytest.importorskip("torch")
 
 from warp_neumat import models  # noqa: E402
 from warp_neumat.io.brdf import open_brdf  # noqa: E402
+from warp_neumat.kernels.healpix_tree import directions as grid_directions  # noqa: E402
 from warp_neumat.models import codebook as vq  # noqa: E402
-from warp_neumat.models import neubrdf  # noqa: E402
+from warp_neumat.models import healpix_grid, neubrdf, reassign  # noqa: E402
+from warp_neumat.models.local_frame import corner_weights, to_local_frame  # noqa: E402
 from warp_neumat.reference import healpix  # noqa: E402
 from warp_neumat.reference.neubrdf import reference_eval  # noqa: E402
 from warp_neumat.training.losses import LogCosine  # noqa: E402
@@ -27,13 +29,20 @@ def random_model(frame, rng, **options):
         model.codebook.copy_(torch.randn(model.codebook.shape, generator=torch.Generator().manual_seed(1)))
         model.indices.copy_(torch.from_numpy(rng.integers(0, len(model.codebook), len(model.indices))))
         model.quantised.fill_(True)
-        model.layers[-1].weight.mul_(10)
+        model.live.fill_(True)
+        model.level.fill_(len(model._levels) - 1)
+        model.layers(model.net.data)[-1][0].mul_(10)
     return model
 
 
-@pytest.mark.parametrize("frame", ["absolute", "isotropic"])
+@pytest.mark.parametrize("frame", ["absolute", "isotropic", "half", "half-isotropic"])
 @pytest.mark.parametrize(
-    "shape", [{"nside": 4, "bits": 5}, {"nside": 32}, {"nside": 6, "features": 8, "hidden": (32, 16)}]
+    "shape",
+    [
+        {"nside": 4, "bits": 5, "interpolation": "idw"},
+        {"nside": 32},
+        {"nside": 6, "features": 8, "hidden": (32, 16, 8)},
+    ],
 )
 def test_forward_matches_float64(rng, frame, shape):
     model = random_model(frame, rng, **shape)
@@ -64,13 +73,13 @@ def test_isotropic_frame_ignores_rotation_and_mirroring(rng):
 
 def test_grid_points_are_the_corners(rng):
     for nside in (1, 3, 8):
-        ours = neubrdf.grid_points(nside)
+        ours = grid_directions(nside)
         assert len(ours) == healpix.hemisphere_point_count(nside)
         np.testing.assert_allclose(ours, healpix.corner_directions(nside)[: len(ours)], atol=1e-12)
 
 
 def test_colours_differ_within_nearly_every_pixel(rng):
-    colour = neubrdf.colours(16).numpy()
+    colour = healpix_grid.colours(16).numpy()
     corner, _ = healpix.corners(16, directions(rng, 20000))
     same = np.array([len(set(c)) < 4 for c in colour[corner]])
     # Pixels on the four seams and on the rings at |z| = 2/3: 4 seams of 16 rings and 2 rings of 64 in 1536, not more.
@@ -80,19 +89,50 @@ def test_colours_differ_within_nearly_every_pixel(rng):
 
 def prepared(model, source, rng, count=2048):
     samples = BRDFSampler(source, rng).draw(count)
+    if model.texture is not None:
+        samples |= {"uv": rng.random((count, 2), np.float32), "lod": 3 * rng.random(count, np.float32)}
     samples = {name: torch.from_numpy(value) for name, value in samples.items()}
     return {**model.prepare(samples), **LogCosine().target(samples)}
 
 
-@pytest.mark.parametrize("stage", ["features", "codebook", "round"])
-def test_every_trainable_tensor_gets_a_gradient(rng, stage):
+def stage_of(model, kind):
+    return next(stage for stage in model.stages() if stage["kind"] == kind)
+
+
+def begin_codebook(model, batches, loss):
+    model.begin(stage_of(model, "codebook"), lambda: iter(batches), loss, torch.Generator().manual_seed(0))
+
+
+@pytest.mark.parametrize("kind", ["features", "codebook", "round"])
+@pytest.mark.parametrize("texture", [None, (4, 2, 3)])
+def test_fused_gradients_match_autograd(rng, kind, texture):
+    source, loss = open_brdf("analytic:ggx?roughness=0.5&f0=0.9"), LogCosine()
+    model = neubrdf.build(neubrdf.configure(source, {"nside": 4, "bits": 4, "texture": texture}), seed=0)
+    batch = prepared(model, source, rng)
+    if kind != "features":
+        begin_codebook(model, [batch], loss)
+    model.enter(stage_of(model, kind))
+    expected_loss = loss(model.predict(batch), batch)
+    parameters = model.trainable(stage_of(model, kind))
+    expected = torch.autograd.grad(expected_loss, parameters)
+    assert float(model.gradients(batch, loss)) == pytest.approx(float(expected_loss.detach()), rel=1e-4)
+    assert len(parameters) == (2 if texture is None else 3)
+    for parameter, gradient in zip(parameters, expected, strict=True):
+        assert gradient.abs().max() > 0
+        # A hidden unit at 0 that rounding switches on moves single entries.
+        assert (parameter.grad - gradient).norm() < 1e-3 * gradient.norm()
+
+
+@pytest.mark.parametrize("kind", ["features", "codebook", "round"])
+def test_every_trainable_tensor_gets_a_gradient(rng, kind):
     source, loss = open_brdf("analytic:ggx?roughness=0.5&f0=0.9"), LogCosine()
     model = neubrdf.build(neubrdf.configure(source, {"nside": 4, "bits": 4}), seed=0)
     batch = prepared(model, source, rng)
-    if stage != "features":
-        model.begin("codebook", [batch], loss, torch.Generator().manual_seed(0))
+    stage = stage_of(model, kind)
+    if kind != "features":
+        begin_codebook(model, [batch], loss)
     model.enter(stage)
-    loss(model.predict(batch), batch).backward()
+    model.gradients(batch, loss)
     for parameter in model.trainable(stage):
         assert parameter.grad is not None
         assert torch.isfinite(parameter.grad).all()
@@ -101,11 +141,13 @@ def test_every_trainable_tensor_gets_a_gradient(rng, stage):
 
 def test_metric_and_gradient_match_autograd(rng):
     source, loss = open_brdf("analytic:ggx?roughness=0.5&f0=0.9"), LogCosine()
-    model = neubrdf.build(neubrdf.configure(source, {"nside": 2, "features": 4, "bits": 3}), seed=0)
+    model = neubrdf.build(
+        neubrdf.configure(source, {"nside": 2, "features": 4, "bits": 3, "frame": "isotropic"}), seed=0
+    )
     batches = [prepared(model, source, rng, 64), prepared(model, source, rng, 32)]
     total = sum((0.5 * loss.residual(model.predict(b), b) ** 2).sum() for b in batches)
     expected = torch.autograd.grad(total, model.table)[0]
-    gradient, error = model.gradient(batches, loss)
+    gradient, error = reassign.gradient(model, batches, loss)
     torch.testing.assert_close(gradient, expected, rtol=1e-4, atol=1e-5)
     # Every sample touches up to four points of each grid, fewer where it lies on a line between two.
     total = 2.0 * float(total.detach())
@@ -121,25 +163,25 @@ def test_metric_and_gradient_match_autograd(rng):
 
     jacobian = torch.autograd.functional.jacobian(residuals, model.table.detach())  # (r, n, k)
     expected = torch.einsum("rni,rnj->nij", jacobian, jacobian)
-    torch.testing.assert_close(model.metric(batches, loss), expected, rtol=1e-3, atol=1e-4)
+    torch.testing.assert_close(reassign.metric(model, batches, loss), expected, rtol=1e-3, atol=1e-4)
 
 
 def test_reassignment_lowers_the_error(rng):
     source, loss = open_brdf("analytic:ggx?roughness=0.4&f0=0.9,0.5,0.2"), LogCosine()
-    model = neubrdf.build(neubrdf.configure(source, {"nside": 8, "bits": 6}), seed=0)
+    shape = neubrdf.configure(source, {"nside": 8, "bits": 6, "frame": "isotropic"})
+    model = neubrdf.build(shape, seed=0)
     batches = [prepared(model, source, rng, 8192)]
-    optimiser = torch.optim.Adam(model.trainable("features"), lr=5e-3)
+    optimiser = torch.optim.Adam(model.trainable(model.stages()[0]), lr=5e-3)
     for _ in range(60):
-        optimiser.zero_grad()
-        loss(model.predict(batches[0]), batches[0]).backward()
+        model.gradients(batches[0], loss)
         optimiser.step()
-    model.begin("codebook", batches, loss, torch.Generator().manual_seed(0))
+    begin_codebook(model, batches, loss)
 
     def error():
         return float((loss.residual(model.predict(batches[0]).detach(), batches[0]) ** 2).mean())
 
     before = error()
-    model.event("codebook", batches, loss)
+    model.event(stage_of(model, "codebook"), lambda: iter(batches), loss)
     assert error() < 0.95 * before
     assert model.statistics()["codebook_used"] > 48
 
@@ -185,8 +227,12 @@ def test_asset_layout(rng):
         ({"nsides": 4}, "no option 'nsides'; nearest: nside"),
         ({"nside": 0}, r"nside must be a whole number in \[1, 512\]"),
         ({"bits": 17}, "bits must be"),
-        ({"hidden": (64,)}, "hidden must be two multiples of 8"),
-        ({"frame": "iso"}, "frame must be one of absolute, isotropic"),
+        ({"hidden": (64, 20)}, "hidden must be 1 to 4 multiples of 8"),
+        ({"frame": "iso"}, "frame must be one of absolute, isotropic, half, half-isotropic"),
+        ({"frame": "absolute", "symmetry": "reciprocal"}, "symmetry 'reciprocal' needs frame half"),
+        ({"frame": "half", "symmetry": "bilateral"}, "needs frame half-isotropic"),
+        ({"reciprocal": True, "symmetry": "none"}, "contradict each other"),
+        ({"texture": (4, 4)}, "texture must be WIDTH,HEIGHT,CHANNELS"),
     ],
 )
 def test_wrong_options_are_explained(options, message):
@@ -195,11 +241,103 @@ def test_wrong_options_are_explained(options, message):
 
 
 def test_frame_follows_the_source():
-    assert neubrdf.configure(open_brdf("analytic:ggx"), {}).frame == "isotropic"
-    assert neubrdf.configure(open_brdf("analytic:ggx?anisotropy=0.5"), {}).frame == "absolute"
+    isotropic = neubrdf.configure(open_brdf("analytic:ggx"), {})
+    assert (isotropic.frame, isotropic.symmetry, isotropic.nside) == ("half-isotropic", "bilateral", 8)
+    anisotropic = neubrdf.configure(open_brdf("analytic:ggx?anisotropy=0.5"), {})
+    assert (anisotropic.frame, anisotropic.symmetry, anisotropic.nside) == ("half", "reciprocal", 64)
+    assert neubrdf.configure(open_brdf("analytic:ggx"), {"reciprocal": True}).symmetry == "reciprocal"
 
 
 def test_registry_names_the_nearest():
     assert models.find("neubrdf") is neubrdf
     with pytest.raises(ValueError, match="no model 'nubrdf'; nearest: neubrdf"):
         models.find("nubrdf")
+
+
+@pytest.mark.parametrize("interpolation", ["bilinear", "idw", "uniform"])
+def test_corner_weights_are_means(rng, interpolation):
+    direction = torch.from_numpy(directions(rng, 500))
+    corner, weight = corner_weights(8, direction, interpolation)
+    torch.testing.assert_close(weight.sum(1), torch.ones(500))
+    points = grid_directions(8)
+    if interpolation == "idw":
+        distance = np.arccos(
+            np.clip(np.einsum("btc,bc->bt", points[corner.numpy()], direction.double().numpy()), -1, 1)
+        )
+        expected = 1 / np.maximum(distance, 1e-6)
+        np.testing.assert_allclose(weight.numpy(), expected / expected.sum(1, keepdims=True), atol=2e-3)
+        at_corner = corner_weights(8, torch.from_numpy(points[40:41].astype(np.float32)), "idw")
+        assert at_corner[1].max() > 0.999
+
+
+@pytest.mark.parametrize(("frame", "symmetry"), [("half", "reciprocal"), ("half-isotropic", "bilateral")])
+def test_half_frames_fold_what_is_symmetric(rng, frame, symmetry):
+    wi, wo = (torch.from_numpy(directions(rng, 300)) for _ in range(2))
+    there, back = to_local_frame(wi, wo, frame, symmetry), to_local_frame(wo, wi, frame, symmetry)
+    for a, b in zip(there, back, strict=True):
+        torch.testing.assert_close(a, b, rtol=0, atol=2e-6)
+        torch.testing.assert_close(a.norm(dim=1), torch.ones(300), rtol=0, atol=2e-6)
+    if symmetry == "bilateral":
+        mirror = torch.tensor([1.0, -1.0, 1.0])
+        for a, b in zip(there, to_local_frame(wi * mirror, wo * mirror, frame, symmetry), strict=True):
+            torch.testing.assert_close(a, b, rtol=0, atol=2e-6)
+
+
+def test_refined_features_show_what_the_coarse_ones_showed(rng):
+    coarse = torch.from_numpy(rng.normal(size=(healpix_grid.point_count(4), 3)).astype(np.float32))
+    fine = healpix_grid.refine(coarse, 4)
+    assert fine.shape == (healpix_grid.point_count(8), 3)
+    inside = grid_directions(4)[:, 2] >= 0
+    corner, weight = corner_weights(8, torch.from_numpy(grid_directions(4)[inside].astype(np.float32)))
+    torch.testing.assert_close((fine[corner.long()] * weight[..., None]).sum(1), coarse[inside], rtol=0, atol=1e-4)
+
+
+def test_probe_equals_the_torch_gradient(rng):
+    source, loss = open_brdf("analytic:ggx?roughness=0.4&f0=0.9"), LogCosine()
+    model = neubrdf.build(neubrdf.configure(source, {"nside": 4, "bits": 4}), seed=0)
+    batches = [prepared(model, source, rng, 1024) for _ in range(2)]
+    begin_codebook(model, batches, loss)
+    expected_pull, expected_error = reassign.gradient(model, batches, loss)
+    pull, error = reassign.Probe(model, batches, loss)()
+    assert (pull - expected_pull).norm() < 1e-3 * expected_pull.norm()
+    torch.testing.assert_close(error, expected_error, rtol=1e-3, atol=1e-4)
+
+
+def test_several_materials_share_primitives_and_keep_their_own_grids(rng):
+    model = neubrdf.build(neubrdf.NeuBRDFConfig(nside=4, bits=5, frame="half-isotropic"), seed=0, count=2)
+    points = 2 * model.config.points
+    assert len(model.indices) == 2 * points
+    with torch.no_grad():
+        model.codebook.copy_(torch.randn(model.codebook.shape, generator=torch.Generator().manual_seed(1)))
+        model.indices.copy_(torch.from_numpy(rng.integers(0, 32, 2 * points)))
+        model.live.fill_(True)
+        model.quantised.fill_(True)
+    wi, wo = directions(rng, 200), directions(rng, 200)
+    for number in range(2):
+        tensors, header = model.to_asset(number)
+        alone = neubrdf.from_asset(tensors, header["config"])
+        model.rounded = True
+        np.testing.assert_allclose(
+            model.evaluate(wi, wo, material=number), alone.evaluate(wi, wo), rtol=1e-4, atol=1e-5
+        )
+    assert not np.array_equal(model.evaluate(wi, wo, material=0), model.evaluate(wi, wo, material=1))
+
+
+def test_texture_taps_are_the_trilinear_look_up(rng):
+    from warp_neumat.models.neural_texture import NeuralTexture
+
+    texture = NeuralTexture(5, 4, 2, generator=torch.Generator().manual_seed(0))
+    assert texture.sizes == [(5, 4), (2, 2), (1, 1)]
+    centres = torch.tensor([[(i + 0.5) / 5, (j + 0.5) / 4] for j in range(4) for i in range(5)])
+    row, weight = texture.taps(centres, torch.zeros(20))
+    value = (texture.texels[row.long()] * weight[..., None]).sum(1)
+    torch.testing.assert_close(value, texture.texels[:20], rtol=0, atol=1e-6)
+    row, weight = texture.taps(torch.rand(50, 2) * 6 - 3, torch.rand(50) * 9 - 2)
+    torch.testing.assert_close(weight.sum(1), torch.ones(50))
+    assert 0 <= int(row.min()) <= int(row.max()) < len(texture.texels)
+    last = texture.taps(torch.rand(9, 2), torch.full((9,), 7.0))
+    value = (texture.texels[last[0].long()] * last[1][..., None]).sum(1)
+    torch.testing.assert_close(value, texture.texels[-1:].expand(9, 2))
+    loaded = NeuralTexture(5, 4, 2, generator=torch.Generator().manual_seed(1))
+    loaded.load(texture.mips())
+    torch.testing.assert_close(loaded.texels, texture.texels.half().float())

@@ -16,7 +16,7 @@ from warp_neumat.training.losses import LogCosine  # noqa: E402
 from warp_neumat.training.sphere import render_sphere, sphere_error  # noqa: E402
 
 SOURCE = "analytic:ggx?roughness=0.5&f0=0.9,0.6,0.3&diffuse=0.1"
-TINY = {"nside": 4, "bits": 5, "features": 8, "hidden": (16, 16)}
+TINY = {"nside": 4, "bits": 5, "features": 8, "hidden": (16, 16), "frame": "isotropic"}
 
 
 def make_trainer(checkpoint=None, seed=0, **plan):
@@ -75,11 +75,11 @@ def test_the_model_follows_the_source(tmp_path):
 
 @pytest.mark.parametrize("interrupted_in", ["features", "codebook", "round"])
 def test_resumed_fit_equals_an_uninterrupted_one(tmp_path, interrupted_in):
-    whole = make_trainer(steps=200)
+    whole = make_trainer(steps=700)
     whole.run()
 
     path = tmp_path / "c"
-    first = make_trainer(path, steps=200, checkpoint_seconds=0.0)
+    first = make_trainer(path, steps=700, checkpoint_seconds=0.0)
     save = first._save
 
     def save_then_stop(*arguments):
@@ -92,7 +92,7 @@ def test_resumed_fit_equals_an_uninterrupted_one(tmp_path, interrupted_in):
     with pytest.raises(KeyboardInterrupt):
         first.run()
 
-    second = make_trainer(path, steps=200, checkpoint_seconds=0.0)
+    second = make_trainer(path, steps=700, checkpoint_seconds=0.0)
     assert second.resume()
     second.run()
     for name, value in whole.model.to_asset()[0].items():
@@ -122,7 +122,7 @@ def test_budget_ends_in_time():
 def test_divergence_is_an_error():
     trainer = make_trainer()
     with torch.no_grad():
-        trainer.model.layers[0].weight.fill_(float("nan"))
+        trainer.model.net.fill_(float("nan"))
     with pytest.raises(FloatingPointError, match="diverged in stage features"):
         trainer.run()
 

@@ -30,11 +30,12 @@ def fit(
     source: Annotated[
         str,
         typer.Argument(
-            help="A folder of PBR maps or its .json manifest (model bcf); FILE.npz:NAME, or "
-            "analytic:ggx?roughness=0.2&f0=0.9,0.6,0.3 (model neubrdf)."
+            help="A folder of PBR maps or its .json manifest (model bcf); a MERL .binary, an RGL .bsdf, a .csv of "
+            "samples, FILE.npz:NAME, analytic:ggx?roughness=0.2&f0=0.9,0.6,0.3 or analytic:layered?… (model neubrdf). "
+            "With --shared also FILE.npz, FILE.npz:'gold*', or a folder of measured files."
         ),
     ],
-    out: Annotated[Path, typer.Option("-o", "--out", help="Asset to write, ending in .neumat.")],
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="Asset to write, ending in .neumat.")] = None,
     model: Annotated[
         str | None, typer.Option(help="Kind of material: bcf or neubrdf; default: the one that SOURCE is for.")
     ] = None,
@@ -66,10 +67,24 @@ def fit(
             "roughness.channel=g, height.replace_nan=0, metallic=0 (a constant), mask=none (left out)."
         ),
     ] = None,
+    shared: Annotated[
+        Path | None,
+        typer.Option(
+            help="neubrdf: fit all materials of SOURCE into this folder, in groups that share primitives and decoder; "
+            "where it holds groups, the materials join them and nothing else is touched."
+        ),
+    ] = None,
+    groups: Annotated[
+        int | None, typer.Option(min=1, help="With --shared: groups; default: one for about eight materials.")
+    ] = None,
+    reciprocal: Annotated[
+        bool, typer.Option("--reciprocal", help="neubrdf: light and viewer can be swapped, exactly.")
+    ] = False,
     option: Annotated[
         list[str] | None,
         typer.Option(
-            help="Any other setting of the model or of its training, repeatable: wrap=clamp, modes=single, batch=65536."
+            help="Any other setting of the model or of its training, repeatable: wrap=clamp, modes=single, "
+            "batch=65536, nside=64, bits=9, hidden=64,64, frame=absolute, interpolation=uniform."
         ),
     ] = None,
     device: Device = "cpu",
@@ -80,10 +95,17 @@ def fit(
     neumat fit bricks/ -o bricks.neumat --preset 1k
     neumat fit bricks/ -o bricks.neumat --crop 0,0,512,512 --override normal.orientation=dx
     neumat fit FILE.npz:alum-bronze -o bronze.neumat
+    neumat fit FILE.npz --shared metals/
     """
-    if out.suffix.lower() != ".neumat":
+    if (out is None) == (shared is None):
+        raise Usage("give either -o FILE.neumat, or --shared DIR for many materials")
+    if out is not None and out.suffix.lower() != ".neumat":
         raise Usage(f"-o must end in .neumat, got {str(out)!r}")
+    if groups is not None and shared is None:
+        raise Usage("--groups is for --shared")
     config = parse_options(option or [], _OWN)
+    if reciprocal:
+        config["reciprocal"] = True
     opening = {
         "size": None if size is None else parse_set_size(size),
         "crop": None if crop is None else parse_crop(crop),
@@ -98,7 +120,11 @@ def fit(
     from warp_neumat.models import REGISTRY
     from warp_neumat.training import fit as training
 
+    if shared is not None:
+        model = "neubrdf" if model is None else one_of("--model", model, ["neubrdf"])
     model = training.default_model(source) if model is None else one_of("--model", model, REGISTRY)
+    if reciprocal and model != "neubrdf":
+        raise Usage(f"--reciprocal is for model neubrdf, not {model}")
     if preset is not None:
         one_of("--preset", preset, training.presets(model))
     for name in opening if model != "bcf" else ():
@@ -106,6 +132,10 @@ def fit(
             raise Usage(f"--{name.removesuffix('s') if name == 'overrides' else name} is for model bcf, not {model}")
 
     start = time.perf_counter()
+    if shared is not None:
+        _fit_shared(source, shared, groups, preset, steps, seed, resume, config)
+        print(f"{shared}: {time.perf_counter() - start:.0f} s")
+        return
     with progress_bar(f"fit {out.stem}") as progress:
         header = training.fit(
             source,
@@ -121,6 +151,30 @@ def fit(
             **config,
         )
     print(f"{out}: {_figures(header.get('metrics', {}))} ({time.perf_counter() - start:.0f} s)")
+
+
+def _fit_shared(source, folder: Path, groups, preset, steps, seed, resume, config) -> None:
+    from warp_neumat.io.brdf_set import open_brdfs
+    from warp_neumat.models.neubrdf import DEFAULT_STEPS
+    from warp_neumat.training.fit import PRESETS
+    from warp_neumat.training.sharing import fit_shared
+
+    if preset is not None and steps is None:
+        steps = round(PRESETS[one_of("--preset", preset, PRESETS)] * DEFAULT_STEPS)
+    with progress_bar(f"fit {folder.name}") as progress:
+        headers = fit_shared(
+            open_brdfs(source),
+            folder,
+            count=groups,
+            steps=steps,
+            seed=seed,
+            resume=resume,
+            progress=progress,
+            announce=lambda text: print(text, flush=True),
+            **config,
+        )
+    for name, header in headers.items():
+        print(f"{folder / name}.neumat: {header['group']['file']}, {_figures(header['metrics'])}")
 
 
 def _figures(record: dict) -> str:

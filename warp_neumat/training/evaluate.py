@@ -4,24 +4,34 @@ from __future__ import annotations
 
 import numpy as np
 
+from warp_neumat.training.furnace import energy, reciprocity_error
 from warp_neumat.training.samplers import measured_directions
 from warp_neumat.training.sphere import render_sphere, sphere_error, tone_map
 
 
 def brdf_metrics(source, eval_fn, *, size: int = 256) -> dict:
-    """Return ``mae, rmse, ssim`` of the rendered sphere and ``mse_raw``.
+    """Return ``mae, rmse, ssim`` of the rendered sphere, ``mse_raw``, and the energy and reciprocity of the fit.
 
     Args:
         source: The BRDF source.
         eval_fn: The asset's ``(wi, wo) -> (N, 3)``, value without the cosine in 1/sr.
 
     ``mse_raw`` is the mean squared error of the BRDF values themselves, in 1/sr², on 2¹⁷ directions spaced as a MERL
-    table is. The sphere is that of :func:`warp_neumat.training.sphere.render_sphere`.
+    table is; mirror peaks of several hundred decide it, so ``mse_log`` is that of log(1 + f) there. The
+    sphere is that of :func:`warp_neumat.training.sphere.render_sphere`. ``albedo_max``, ``albedo_max_source``,
+    ``albedo_excess`` and ``reciprocity`` are those of :mod:`warp_neumat.training.furnace`.
     """
     error = sphere_error(render_sphere(eval_fn, size), render_sphere(source.eval, size))
     wi, wo = measured_directions(1 << 17, np.random.default_rng(0))
-    difference = np.asarray(eval_fn(wi, wo), np.float64) - source.eval(wi, wo)
-    return {**error, "mse_raw": float((difference**2).mean())}
+    fitted, expected = np.asarray(eval_fn(wi, wo), np.float64), source.eval(wi, wo).astype(np.float64)
+    logarithms = np.log1p(fitted) - np.log1p(expected)
+    return {
+        **error,
+        "mse_raw": float(((fitted - expected) ** 2).mean()),
+        "mse_log": float((logarithms**2).mean()),
+        **energy(eval_fn, source.eval, isotropic=bool(source.isotropic)),
+        "reciprocity": reciprocity_error(eval_fn),
+    }
 
 
 def sphere_strip(source_fn, asset_fn, *, size: int = 256) -> np.ndarray:

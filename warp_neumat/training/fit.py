@@ -6,6 +6,7 @@ leave a checkpoint beside the output and go on from there with ``resume=True``.
 
 from __future__ import annotations
 
+import dataclasses
 import difflib
 import json
 import math
@@ -47,7 +48,7 @@ class BRDFData:
     @staticmethod
     def sampler(source):
         """Return ``sampler(rng, count)`` for :class:`warp_neumat.training.loop.Trainer`."""
-        return lambda rng, count: samplers.BRDFSampler(source, rng).draw(count)
+        return lambda rng, count: samplers.sampler(source, rng).draw(count)
 
     @staticmethod
     def opening(source, arguments: dict) -> dict:
@@ -68,7 +69,11 @@ class BRDFData:
     @staticmethod
     def stored(module, source, trainer) -> tuple[dict, dict, dict]:
         """Return (tensors, header, metrics) of the trained model, measured on what will be stored."""
-        tensors, header = trainer.model.cpu().to_asset()
+        model = trainer.model.cpu()
+        if not model.has_file:
+            header = {"kind": "neubrdf", "version": module.VERSION, "config": dataclasses.asdict(model.config)}
+            return {}, header, {**brdf_metrics(source, model.evaluate), "bytes": model.bytes}
+        tensors, header = model.to_asset()
         metrics = brdf_metrics(source, module.from_asset(tensors, header["config"]).evaluate)
         return tensors, header, metrics
 
@@ -231,8 +236,9 @@ def fit(
             header["source"]["opening"] = settled
         seconds = facts.pop("seconds")  # returned, but not stored: the same seed gives the same file
         header["training"] = {**facts, **trainer.model.statistics()}
-        header["metrics"] = {**metrics, "bytes": size}
-        write_asset(out, tensors, header)
+        header["metrics"] = {"bytes": size, **metrics}
+        if tensors:  # what is fitted for comparison alone has no file
+            write_asset(out, tensors, header)
         header["training"]["seconds"] = seconds
     finally:
         torch.set_num_threads(threads)

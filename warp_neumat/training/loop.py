@@ -16,10 +16,10 @@ import torch
 
 from warp_neumat.training import checkpoint
 
-CHUNK = 16
+CHUNK = 32
 """Batches that are drawn at once, and gone through :data:`PASSES` times before the next are drawn."""
 
-PASSES = 2
+PASSES = 4
 EVENT_BATCH = 16384
 
 
@@ -121,9 +121,9 @@ class Trainer:
         if self._step == 0 and self._pending is None:
             self._report(stage, f"{name}: preparing")
             generator = torch.Generator().manual_seed(self.plan.seed * 1000 + self._stage)
-            self.model.begin(name, self._event_batches(0), self.loss, generator)
-        self.model.enter(name)
-        parameters = self.model.trainable(name)
+            self.model.begin(stage, lambda: self._event_batches(0), self.loss, generator)
+        self.model.enter(stage)
+        parameters = self.model.trainable(stage)
         optimiser = torch.optim.Adam(parameters, lr=stage["lr"][0], betas=(0.9, 0.99), eps=1e-10, fused=True)
         if self._pending is not None:
             checkpoint.restore_optimiser(optimiser, parameters, self._pending)
@@ -144,16 +144,15 @@ class Trainer:
             high, low = stage["lr"]
             optimiser.param_groups[0]["lr"] = low + (high - low) * 0.5 * (1.0 + math.cos(math.pi * position))
             optimiser.zero_grad(set_to_none=True)
-            loss = self.loss(self.model.predict(batch), batch)
-            loss.backward()
+            loss = self.model.gradients(batch, self.loss)
             optimiser.step()
             self._step += 1
             if within == CHUNK - 1:
-                self.last_loss = float(loss.detach())
+                self.last_loss = float(loss)
                 if not math.isfinite(self.last_loss):
                     raise FloatingPointError(f"the fit diverged in stage {name} at step {self._step}; try another seed")
                 self._report(stage, f"{name}: loss {self.last_loss:.4f}")
-        self.last_loss = float(loss.detach()) if chunk is not None else self.last_loss
+        self.last_loss = float(loss) if chunk is not None else self.last_loss
         self._tick()
 
     def _between_chunks(self, stage, position, optimiser, parameters) -> None:
@@ -162,9 +161,8 @@ class Trainer:
         # The last quarter of a stage is free of events, to settle.
         while self._event < stage["events"] and position >= 0.75 * self._event / stage["events"]:
             self._event += 1
-            batches = list(self._event_batches(self._event))
             self._report(stage, f"{stage['name']}: taking stock {self._event}/{stage['events']}")
-            self.model.event(stage["name"], batches, self.loss)
+            self.model.event(stage, lambda: self._event_batches(self._event), self.loss)
         if self.checkpoint is not None and time.monotonic() - self._last_save >= self.plan.checkpoint_seconds:
             self._tick()
             self._save(optimiser, parameters)
