@@ -7,9 +7,10 @@ RGL materials, or on any source of ``neumat fit``. ``python -m bench.brdf`` take
 - ``frame``: time to evaluate a 1920×1080 frame of a fitted material, beside the bare network, without grids, in Dr.Jit.
 - ``table3``: every material × method, then the means; ``misses`` counts the materials beyond MAE 0.0017 or SSIM 0.996,
   the paper's means over all 100 MERL materials, which then follow by name where the method is ours.
-- ``table4``: features as 9-bit indices, plain fp16 or 4 bits each, on the paper's grid; ``mse_factor`` and
-  ``bytes_factor`` are to plain features, bytes without the decoder.
-- ``figure8``: width of the network, grid, bits, width of the features and pixelation, one at a time.
+- ``table4``: features as 9-bit indices, plain fp16 or 4 bits each, on the paper's grid; ``mse_raw_factor``,
+  ``mse_log_factor`` and ``bytes_factor`` are to plain features, bytes without the decoder.
+- ``figure8``: width of the network, grid, bits, width of the features, pixelation, corner weights and frame, one at a
+  time.
 
 **Protocol.** MAE, RMSE and SSIM are of a sphere of 256×256 pixels seen from the front, orthographic, under two
 directional lights (``training/sphere.py``): a key light 45° off the view at irradiance π, so that a white Lambertian
@@ -33,8 +34,8 @@ from pathlib import Path
 from ._brdf_lab import BASELINES, MATERIALS, OURS, SETS, TABLES, Choice, Lab
 
 COLUMNS = [
-    "table", "material", "method", "mae", "rmse", "ssim", "mse_raw", "albedo_max", "bytes", "seconds", "points", "ms",
-    "peer_ms", "ratio", "misses",
+    "table", "material", "method", "mae", "rmse", "ssim", "mse_raw", "mse_log", "albedo_max", "bytes", "seconds",
+    "points", "ms", "peer_ms", "ratio", "misses",
 ]  # fmt: skip
 
 GOAL = {"mae": 0.0017, "ssim": 0.996}
@@ -55,6 +56,8 @@ AXES = {
     "bits": [{"bits": n} for n in (5, 7, 9, 11)],
     "features": [{"features": n} for n in (4, 8, 16, 32)],
     "pixelation": [{"pixelation": name} for name in ("healpix", "lonlat", "sukharev", "fibonacci")],
+    "weights": [{"interpolation": name} for name in ("bilinear", "idw", "uniform")],
+    "frame": [{"frame": name} for name in ("half-isotropic", "half", "isotropic", "absolute")],
 }
 """Figure 8: axis → options, the others as the fit has them, but for a grid of nside 32 where it is not the axis."""
 
@@ -114,7 +117,7 @@ def table4(lab: Lab):
         kind = "vq" if options["storage"] == "codebook" else options["storage"]
         found["bytes"] = feature_bytes(points, PAPER_GRID["features"], kind, PAPER_GRID["bits"])
         base = base or found
-        factors = {"mse_factor": found["mse_raw"] / base["mse_raw"], "bytes_factor": found["bytes"] / base["bytes"]}
+        factors = {f"{name}_factor": found[name] / base[name] for name in ("mse_raw", "mse_log", "bytes")}
         material = f"mean of {len(lab.materials)}"
         yield {"table": "table4", "material": material, "method": method, "points": points, **found, **factors}
 

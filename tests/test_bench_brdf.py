@@ -28,7 +28,7 @@ def fits(monkeypatch):
         asked.append({"source": source, "steps": steps, "seed": seed, **options})
         if options.get("storage", "codebook") == "codebook":
             out.write_text(json.dumps({"source": source, "gain": 1.0 if "hidden" in options else 1.5}))
-        metrics = {"mae": 0.001, "rmse": 0.002, "ssim": 0.999, "mse_raw": 0.25, "bytes": 7}
+        metrics = {"mae": 0.001, "rmse": 0.002, "ssim": 0.999, "mse_raw": 0.25, "mse_log": 0.1, "bytes": 7}
         return {"config": {"frame": options.get("frame")}, "metrics": metrics, "training": {"seconds": 1.5}}
 
     def load(path, device):
@@ -41,7 +41,8 @@ def fits(monkeypatch):
         error = sphere_error(render_sphere(evaluate, size), render_sphere(source.eval, size))
         wi, wo = measured_directions(2000, np.random.default_rng(0))
         found, true = evaluate(wi, wo), source.eval(wi, wo)
-        return {**error, "mse_raw": float(((found - true) ** 2).mean()), "albedo_max": float(found.mean())}
+        raw = float(((found - true) ** 2).mean())
+        return {**error, "mse_raw": raw, "mse_log": raw, "albedo_max": float(found.mean())}
 
     monkeypatch.setattr("warp_neumat.training.fit.fit", fit)  # first: its module takes the true metrics
     monkeypatch.setattr("warp_neumat.training.evaluate.brdf_metrics", metrics)
@@ -93,11 +94,11 @@ def test_table4_and_figure8_from_few_fits(fits):
     table = {row["method"]: row for row in found}
     assert table["codebook"]["bytes_factor"] == pytest.approx(0.0454, abs=1e-4)
     assert table["4 bit"]["bytes_factor"] == pytest.approx(0.25, abs=1e-3)
-    assert table["plain features"]["mse_factor"] == 1.0
+    assert table["plain features"]["mse_raw_factor"] == 1.0
     assert table["plain features"]["mse_raw"] == 0.25  # told by the fit: there is no file
     assert {row["axis"] for row in found if row["table"] == "figure8"} == set(brdf.AXES)
     assert table["width 64x64"]["mae"] < 1e-6 < table["bits 9"]["mae"]
-    assert all(f["frame"] == "absolute" for f in fits)
+    assert {f["frame"] for f in fits} == {"absolute", "half", "half-isotropic", "isotropic"}  # the last three: the axis
     assert len({json.dumps(f, sort_keys=True) for f in fits}) == len(fits)  # nothing twice
 
 

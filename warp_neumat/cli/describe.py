@@ -6,7 +6,7 @@ import math
 def describe(header: dict, tensors: dict) -> list[str]:
     """Return the lines of an asset's header and tensors (name → dtype, shape, bytes), by kind."""
     lines = _maps(header.get("config", {}), tensors) if header["kind"] == "bcf" else _fields(header, "config")
-    for part in ("source", "training", "metrics"):
+    for part in ("group", "source", "training", "metrics"):
         lines += _fields(header, part)
     for name, file in header.get("maps", {}).get("files", {}).items():
         lines.append(f"  maps.{name}: {file}")

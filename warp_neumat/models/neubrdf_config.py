@@ -105,10 +105,18 @@ def configure(source, options: dict) -> NeuBRDFConfig:
         defaults["symmetry"] = symmetry if isotropic or symmetry != "bilateral" else "reciprocal"
     if frame == "half-isotropic":
         defaults |= ISOTROPIC
+    if getattr(source, "samples", None) is not None and frame.startswith("half"):
+        defaults |= {"nside": _sparse_nside(len(source.samples[0])), "bits": 9}
     elif frame == "isotropic":
         defaults["nside"] = 32
     return NeuBRDFConfig(**{**defaults, **options})
 
 
-ISOTROPIC = {"nside": 8, "bits": 9}
+def _sparse_nside(samples: int) -> int:
+    """Return the resolution whose points are about as many as the samples, a power of two in [2, 16]."""
+    wanted = (samples / 6) ** 0.5
+    return next((nside for nside in (16, 8, 4) if wanted >= nside), 2)
+
+
+ISOTROPIC = {"nside": 16, "bits": 11}
 """Grid and codebook of isotropic materials in the half-vector frame."""

@@ -87,7 +87,7 @@ class Probe:
         batch = len(batches[0]["corner"])
         self.step = BRDFStep(
             model.shape, table, [0, 0, self.words][: len(model.shape.groups)], model.net.detach().clone(), batch=batch,
-            parts=min(8, dispatch.worker_count()), sharpness=loss.sharpness, softness=self.SOFTNESS,
+            parts=min(4, dispatch.worker_count()), sharpness=loss.sharpness, softness=self.SOFTNESS,
         )  # fmt: skip
 
     def __call__(self, backward: bool = True) -> tuple[torch.Tensor, torch.Tensor]:

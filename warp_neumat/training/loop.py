@@ -29,7 +29,7 @@ class Plan:
 
     steps: int
     """Optimiser steps over all stages."""
-    batch: int = 8192
+    batch: int = 4096
     """Samples a step."""
     seed: int = 0
     """Decides every random draw."""
@@ -128,17 +128,14 @@ class Trainer:
         if self._pending is not None:
             checkpoint.restore_optimiser(optimiser, parameters, self._pending)
             self._pending = None
-        chunk, order, length = None, None, CHUNK * self.plan.batch
+        chunk, length = None, CHUNK * self.plan.batch
         while (position := self._position(stage)) < 1.0:
             within = self._step % (CHUNK * PASSES)
             if within == 0 or chunk is None:
                 self._between_chunks(stage, position, optimiser, parameters)
                 chunk = self._prepared(length, 0, self._stage, self._step // (CHUNK * PASSES))
-                order = None
             if within % CHUNK == 0 and within:
-                draw = np.random.default_rng([self.plan.seed, 2, self._stage, self._step])
-                order = torch.from_numpy(draw.permutation(length)).to(self.device)
-                chunk = {key: value[order] for key, value in chunk.items()}
+                chunk = self._shuffled(chunk)
             start = within % CHUNK * self.plan.batch
             batch = {key: value[start : start + self.plan.batch] for key, value in chunk.items()}
             high, low = stage["lr"]
@@ -154,6 +151,13 @@ class Trainer:
                 self._report(stage, f"{name}: loss {self.last_loss:.4f}")
         self.last_loss = float(loss) if chunk is not None else self.last_loss
         self._tick()
+
+    def _shuffled(self, chunk) -> dict[str, torch.Tensor]:
+        """Return a chunk in another order: runs of 64 samples are moved as they are, at the speed of memory."""
+        run = math.gcd(self.plan.batch, 64)
+        draw = np.random.default_rng([self.plan.seed, 2, self._stage, self._step])
+        order = torch.from_numpy(draw.permutation(CHUNK * self.plan.batch // run)).to(self.device)
+        return {key: value.view(-1, run, value.shape[1])[order].flatten(0, 1) for key, value in chunk.items()}
 
     def _between_chunks(self, stage, position, optimiser, parameters) -> None:
         """Do what may happen only here: an event that is due, a checkpoint that is due."""
