@@ -242,10 +242,10 @@ def test_wrong_options_are_explained(options, message):
 
 def test_frame_follows_the_source():
     isotropic = neubrdf.configure(open_brdf("analytic:ggx"), {})
-    assert (isotropic.frame, isotropic.symmetry, isotropic.nside) == ("half-isotropic", "bilateral", 8)
+    assert (isotropic.frame, isotropic.symmetry, isotropic.nside) == ("half-isotropic", "bilateral", 16)
     anisotropic = neubrdf.configure(open_brdf("analytic:ggx?anisotropy=0.5"), {})
     assert (anisotropic.frame, anisotropic.symmetry, anisotropic.nside) == ("half", "reciprocal", 64)
-    assert neubrdf.configure(open_brdf("analytic:ggx"), {"reciprocal": True}).symmetry == "reciprocal"
+    assert neubrdf.configure(open_brdf("analytic:ggx"), {"reciprocal": True}).symmetry == "bilateral"
 
 
 def test_registry_names_the_nearest():
@@ -284,9 +284,9 @@ def test_half_frames_fold_what_is_symmetric(rng, frame, symmetry):
 
 
 def test_refined_features_show_what_the_coarse_ones_showed(rng):
-    coarse = torch.from_numpy(rng.normal(size=(healpix_grid.point_count(4), 3)).astype(np.float32))
+    coarse = torch.from_numpy(rng.normal(size=(healpix.hemisphere_point_count(4), 3)).astype(np.float32))
     fine = healpix_grid.refine(coarse, 4)
-    assert fine.shape == (healpix_grid.point_count(8), 3)
+    assert fine.shape == (healpix.hemisphere_point_count(8), 3)
     inside = grid_directions(4)[:, 2] >= 0
     corner, weight = corner_weights(8, torch.from_numpy(grid_directions(4)[inside].astype(np.float32)))
     torch.testing.assert_close((fine[corner.long()] * weight[..., None]).sum(1), coarse[inside], rtol=0, atol=1e-4)
@@ -341,3 +341,53 @@ def test_texture_taps_are_the_trilinear_look_up(rng):
     loaded = NeuralTexture(5, 4, 2, generator=torch.Generator().manual_seed(1))
     loaded.load(texture.mips())
     torch.testing.assert_close(loaded.texels, texture.texels.half().float())
+
+
+@pytest.mark.parametrize("pixelation", ["lonlat", "sukharev", "fibonacci"])
+@pytest.mark.parametrize("storage", ["raw", "codebook"])
+def test_other_pixelations_and_storages_are_trained_with_their_own_counts(rng, pixelation, storage):
+    source, loss = open_brdf("analytic:ggx?roughness=0.5&f0=0.9"), LogCosine()
+    options = {"nside": 8, "bits": 4, "features": 4, "pixelation": pixelation, "storage": storage, "frame": "half"}
+    model = neubrdf.build(neubrdf.configure(source, options), seed=0)
+    assert not model.has_file
+    batches = [prepared(model, source, rng, 1024) for _ in range(2)]
+    for stage in model.stages():
+        model.begin(stage, lambda: iter(batches), loss, torch.Generator().manual_seed(0))
+        model.enter(stage)
+        model.gradients(batches[0], loss)
+        if stage["events"]:
+            model.event(stage, lambda: iter(batches), loss)
+    wi, wo = directions(rng, 200), directions(rng, 200)
+    assert np.isfinite(model.evaluate(wi, wo)).all()
+    assert model.bytes > 0
+    with pytest.raises(ValueError, match="is for comparison; it has no file"):
+        model.to_asset()
+
+
+def test_points_that_no_sample_touched_evaluate_as_in_the_file(rng):
+    source, loss = open_brdf("analytic:ggx?roughness=0.5&f0=0.9&anisotropy=0.5"), LogCosine()
+    model = neubrdf.build(neubrdf.configure(source, {"nside": 8, "bits": 4}), seed=0)
+    batch = prepared(model, source, rng, 64)  # few samples on many points
+    with torch.no_grad():
+        model.table.normal_()
+    model.level.fill_(len(model._levels) - 1)
+    batch = prepared(model, source, rng, 64)
+    begin_codebook(model, [batch], loss)
+    model.event(stage_of(model, "codebook"), lambda: iter([batch]), loss)
+    assert 0.05 < model.live.float().mean() < 0.7
+    tensors, header = model.to_asset()
+    stored = neubrdf.from_asset(tensors, header["config"])
+    assert torch.equal(stored.indices, model.indices)
+    model.rounded = True
+    wi, wo = directions(rng, 500), directions(rng, 500)
+    np.testing.assert_allclose(stored.evaluate(wi, wo), model.evaluate(wi, wo), rtol=1e-4, atol=1e-5)
+
+
+def test_uniform_weights_are_evaluated_as_they_run(rng):
+    model = random_model("half", rng, nside=6, interpolation="uniform")
+    tensors, header = model.to_asset()
+    wi, wo = directions(rng, 500), directions(rng, 500)
+    expected = reference_eval(tensors, header["config"], wi, wo)
+    got = neubrdf.from_asset(tensors, header["config"]).evaluate(wi, wo)
+    close = np.abs(got - expected) / (1 + expected) < 1e-4
+    assert close.all(1).mean() > 0.97  # weights of 1/4 jump at pixel edges, where rounding decides

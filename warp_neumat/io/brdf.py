@@ -138,7 +138,7 @@ class NetworkBRDF:
         self._w1, self._b1 = np.ascontiguousarray(w1.T), np.ascontiguousarray(b1[:, None])
         self._w2, self._b2 = np.ascontiguousarray(w2.T), np.ascontiguousarray(b2[:, None])
         # OpenBLAS hands a product of more than 2^18 multiplications to threads of its own, which then fight with ours.
-        self._block = max(16, 1 << int(np.log2(2**18 / w1.size)))
+        self._block = max(16, 1 << max(0, int(np.log2(2**18 / w1.size))))
 
     def eval(self, wi, wo):
         """Return (N, 3) float32 in 1/sr, without the cosine."""

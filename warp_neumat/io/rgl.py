@@ -123,7 +123,7 @@ class RGL:
         value = self._values.at(*self._warp.invert(*u, slices), slices)
         if self._jacobian:
             sigma = self._sigma.at(np.sqrt(theta * (2 / _PI)), (phi + _PI) / (2 * _PI))
-            value = value * (self._ndf.at(*u) / (4.0 * sigma))[:, None]
+            value = value * (self._ndf.at(*u) / (4.0 * np.maximum(sigma, 1e-9)))[:, None]
         return np.maximum(value / cosine[:, None], 0.0)
 
 
@@ -168,6 +168,9 @@ def _check(name: str, fields) -> dict[str, tuple]:
     for key in ("ndf", "sigma", "vndf", data):
         if min(shapes[key][-2:]) < 2:
             raise ValueError(f"{name}: field {key} must be at least 2 by 2, got shape {shapes[key]}")
+    for key in ("ndf", "sigma", "vndf"):
+        if not np.isfinite(fields[key]).all():
+            raise ValueError(f"{name}: field {key} holds values that are not finite; fetch the file again")
     for key in ("phi_i", "theta_i"):
         if (np.diff(fields[key]) <= 0).any():
             raise ValueError(f"{name}: field {key} must ascend")

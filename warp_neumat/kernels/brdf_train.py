@@ -21,6 +21,7 @@ import functools
 import warp as wp
 
 from warp_neumat.kernels import dispatch
+from warp_neumat.kernels.neubrdf import LOG_LIMIT
 
 PATCH = 64
 """Samples that go through the network at once: their activations (80 kB at 32→64→64→3) stay in second-level cache."""
@@ -76,7 +77,7 @@ class StepShape:
     def scratch(self) -> int:
         """Float32 words of scratch a part needs."""
         transposed = sum(a * b for a, b in zip(self.rows, self.hidden, strict=False))
-        return 2 * PATCH * sum(self.rows) + 8 * PATCH + transposed + 64
+        return 2 * PATCH * sum(self.rows) + 4 * PATCH + transposed + 64
 
     @property
     def flops(self) -> int:
@@ -170,7 +171,7 @@ def _cpu_code(shape: StepShape) -> str:
     text.append("at += (16 - ((unsigned long long)at / 4) % 16) % 16;")
     for n, width in enumerate(rows):
         text.append(f"float* const A{n} = at; at += {PATCH * width}; float* const D{n} = at; at += {PATCH * width};")
-    text.append("float* const Y = at; at += 4 * L; float* const C = at; at += 4 * L;")
+    text.append("float* const Y = at; at += 4 * L;")
     # The backward pass multiplies by the transposed matrices.
     for n in range(depth):
         weights = shape.offsets[n][1]
@@ -222,8 +223,8 @@ def _cpu_code(shape: StepShape) -> str:
         V y = *(const V*)(Y + c * L + l), t;
         for (int i = 0; i < 8; ++i) t[i] = wanted[3 * (l + i) + c];
         const V slope = sharpness * *(const V*)(cosines + l);
-        const I8 high = y > 16.0f;
-        y = select(high, Z + 16.0f, y);
+        const I8 high = y > {LOG_LIMIT}f;
+        y = select(high, Z + {LOG_LIMIT}f, y);
         const V e = exponential(y), x = slope * (e - 1.0f);
         const I8 positive = x > 0.0f;
         const V up = select(positive, x, Z);

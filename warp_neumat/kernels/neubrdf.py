@@ -33,6 +33,9 @@ PAD = 16
 CHANNEL_PAD = 8
 """Channels of a texel are padded with zeros to a multiple of this."""
 
+LOG_LIMIT = 11.0
+"""Largest output of the network: log(1 + f) of 59,873 per steradian, below float16's largest number."""
+
 _MODULE = {"module": "unique", "module_options": dispatch.module_options()}
 
 
@@ -331,8 +334,8 @@ def functions(layout: Layout, lanes: int, single: bool = False) -> types.SimpleN
         )  # fmt: skip
         out = wp.array(ptr=value.ptr, shape=(3 * L,), dtype=wp.float32)
         for l in range(3 * L):
-            # exp(y) − 1, held below float16's largest number; a BRDF is not negative.
-            e = exp2(wp.min(out[l], 11.0) * 1.4426950408889634)
+            # exp(y) − 1; a BRDF is not negative.
+            e = exp2(wp.min(out[l], LOG_LIMIT) * 1.4426950408889634)
             out[l] = wp.max(e - 1.0, 0.0)
         if wp.static(textured):
             cosine = wp.array(ptr=wi.ptr + wp.uint64(2 * L) * FLOAT, shape=(L,), dtype=wp.float32)

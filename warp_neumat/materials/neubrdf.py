@@ -4,7 +4,8 @@ The asset, versions 1 and 2; a key that version 1 lacks has the value in bracket
 
 - config: ``nside``, ``features`` k, ``bits`` b, ``hidden`` (1 … 4 widths), ``frame``, ``symmetry`` ["none"],
   ``interpolation`` ["bilinear"], ``output`` ["expm1"], ``texture`` [null] or {width, height, channels, mips};
-- ``codebook`` (2^b, k) float16; ``indices``, a stream of b bits each for the 2n points of both grids;
+- ``codebook`` (rows, k) float16, at most 2^b rows; ``indices``, a stream of b bits each for the 2n points of both
+  grids;
 - ``live`` (optional), zlib-compressed bits of which points ``indices`` has; the others take their ancestors'
   (``kernels/healpix_tree.py``);
 - ``weight{n}``, ``bias{n}`` float16, ReLU between layers; inputs: side 0's feature, side 1's, the texture's;
@@ -49,13 +50,18 @@ class NeuBRDF(Material):
         self.device = wp.get_device(device)
         self.config = config = _checked(header.get("config"), path)
         features, hidden, texture = config["features"], tuple(config["hidden"]), config["texture"]
-        codebook = expect(tensors, "codebook", "float16", (2 ** config["bits"], features), path)
+        rows = len(tensors["codebook"]) if np.ndim(tensors.get("codebook")) == 2 else 1
+        if rows > 2 ** config["bits"]:
+            raise FormatError(path, "codebook", f"has {rows} rows, more than {config['bits']} bits can name", _AGAIN)
+        codebook = expect(tensors, "codebook", "float16", (rows, features), path)
         channels = texture["channels"] if texture else 0
         widths = (2 * features + channels, *hidden, 3)
         layers = range(len(widths) - 1)
         weights = [expect(tensors, f"weight{n}", "float16", (widths[n + 1], widths[n]), path) for n in layers]
         biases = [expect(tensors, f"bias{n}", "float16", (widths[n + 1],), path) for n in layers]
         index = _indices(tensors, config, path)
+        if int(index.max()) >= rows:
+            raise FormatError(path, "indices", f"name primitive {int(index.max())} of {rows}", "copy or fit it again")
         points = len(index) // 2
         names = ("frame", "symmetry", "interpolation")
         self.layout = kernels.Layout(hidden, *(config[name] for name in names), channels)

@@ -8,11 +8,6 @@ from warp_neumat import ops
 from warp_neumat.kernels.healpix_tree import directions
 
 
-def point_count(nside: int) -> int:
-    """Return the points of one hemisphere's grid, with one ring beyond the equator: 6N² + 6N + 1."""
-    return 6 * nside * nside + 6 * nside + 1
-
-
 def colours(nside: int) -> torch.Tensor:
     """Return a colour 0 … 3 of every grid point, (n,), such that the corners of a pixel differ.
 
@@ -43,6 +38,6 @@ def refine(table: torch.Tensor, nside: int) -> torch.Tensor:
     """
     points = torch.from_numpy(directions(2 * nside))
     # The ring beyond the equator lies outside the coarse hemisphere grid: it mirrors the ring this side of it.
-    points = torch.cat([points[:, :2], points[:, 2:].abs()], 1).float()
+    points = torch.cat([points[:, :2], points[:, 2:].abs()], 1).float().to(table.device)
     corner, weight = ops.healpix_corners(nside, points)
     return ops.grid_gather(table, corner, weight)

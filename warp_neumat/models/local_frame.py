@@ -7,10 +7,6 @@ import torch
 from warp_neumat import ops
 from warp_neumat.kernels.healpix_tree import directions
 
-FRAMES = ("absolute", "isotropic", "half", "half-isotropic")
-SYMMETRIES = ("none", "reciprocal", "bilateral")
-INTERPOLATIONS = ("bilinear", "idw", "uniform")
-
 
 def to_local_frame(wi: torch.Tensor, wo: torch.Tensor, frame: str, symmetry: str = "none"):
     """Return what the grids of side 0 and side 1 are asked for, (B, 3) each, for unit directions above the horizon.

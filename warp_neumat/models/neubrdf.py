@@ -28,11 +28,13 @@ from warp_neumat import ops
 from warp_neumat.io.asset import pack_bits, unpack_bits
 from warp_neumat.kernels import dispatch
 from warp_neumat.kernels.brdf_train import StepShape
+from warp_neumat.kernels.healpix import hemisphere_point_count
 from warp_neumat.kernels.healpix_tree import directions, expand
+from warp_neumat.kernels.neubrdf import LOG_LIMIT
 from warp_neumat.models import codebook as vq
 from warp_neumat.models import reassign
 from warp_neumat.models.feature_storage import feature_bytes, rounded4
-from warp_neumat.models.healpix_grid import levels, point_count, refine
+from warp_neumat.models.healpix_grid import levels, refine
 from warp_neumat.models.local_frame import corner_weights, to_local_frame
 from warp_neumat.models.neubrdf_config import NeuBRDFConfig, configure
 from warp_neumat.models.neural_texture import NeuralTexture
@@ -74,15 +76,16 @@ class NeuBRDF(nn.Module):
         self.shape = StepShape(groups, config.hidden)
         self._levels = levels(config.nside) if config.pixelation == "healpix" else [config.nside]
         self.register_buffer("level", torch.tensor(0))
+        self.points = self._points(config.nside)
         # Features start as smooth functions of the direction (the direction itself first), so that the decoder sees
         # coordinates from the first step on instead of having to untangle noise.
         slope = torch.randn(3, k, generator=generator) * 1.5
         phase = torch.rand(k, generator=generator) * 6.2832
-        self.table = nn.Parameter(torch.zeros(count * 2 * self._points(config.nside), k))
+        self.table = nn.Parameter(torch.zeros(count * 2 * self.points, k))
         self._fill(slope, phase)
         self.codebook = nn.Parameter(torch.zeros(1 << config.bits, k))
-        self.register_buffer("indices", torch.zeros(count * 2 * config.points, dtype=torch.int32))
-        self.register_buffer("live", torch.zeros(count * 2 * config.points, dtype=torch.bool))
+        self.register_buffer("indices", torch.zeros(count * 2 * self.points, dtype=torch.int32))
+        self.register_buffer("live", torch.zeros(count * 2 * self.points, dtype=torch.bool))
         self.register_buffer("quantised", torch.tensor(False))
         self.rounded = False
         self.net = nn.Parameter(self._initial_net(generator))
@@ -90,7 +93,7 @@ class NeuBRDF(nn.Module):
 
     def _points(self, nside: int) -> int:
         if self.config.pixelation == "healpix":
-            return point_count(nside)
+            return hemisphere_point_count(nside)
         from warp_neumat.kernels.pixelations import PIXELATIONS
 
         return PIXELATIONS[self.config.pixelation].points(nside)
@@ -136,8 +139,10 @@ class NeuBRDF(nn.Module):
 
     # --- evaluation ---
 
-    def prepare(self, samples: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    def prepare(self, samples: dict[str, torch.Tensor], interpolation: str | None = None) -> dict[str, torch.Tensor]:
         """Find the grid points of unit directions ``wi`` and ``wo``, (B, 3) each, once for all later passes.
+
+        ``interpolation`` names the corner weights; default: those that the fit sees.
 
         ``material`` (B,) numbers the material where several share; ``uv`` (B, 2) and ``lod`` (B,) where it is textured.
         Returns ``corner`` (B, taps) int32, rows of the present grids (and texels), and ``weight`` (B, taps) float32.
@@ -147,7 +152,7 @@ class NeuBRDF(nn.Module):
         base = samples["material"].view(-1, 1).int() * (2 * points) if "material" in samples else 0
         for side, direction in enumerate(to_local_frame(samples["wi"], samples["wo"], config.frame, config.symmetry)):
             if config.pixelation == "healpix":
-                corner, weight = corner_weights(self.nside, direction, config.training_interpolation)
+                corner, weight = corner_weights(self.nside, direction, interpolation or config.training_interpolation)
             else:
                 from warp_neumat.kernels.pixelations import PIXELATIONS
 
@@ -190,7 +195,7 @@ class NeuBRDF(nn.Module):
 
     def predict(self, batch) -> torch.Tensor:
         """Return the BRDF of a prepared batch in 1/sr, (B, 3), not clamped at 0 so that every sample has a gradient."""
-        return torch.expm1(self.decode(self.gather(batch)).clamp_max(16.0))
+        return torch.expm1(self.decode(self.gather(batch)).clamp_max(LOG_LIMIT))
 
     def forward(self, wi, wo, uv=None, lod=None, material=None) -> torch.Tensor:
         """Return the BRDF in 1/sr without the cosine, (N, 3); 0 below the horizon.
@@ -205,7 +210,8 @@ class NeuBRDF(nn.Module):
             samples |= {"uv": uv, "lod": wi.new_zeros(len(wi)) if lod is None else lod}
         if material is not None:
             samples["material"] = torch.full((len(wi),), material, dtype=torch.int32, device=wi.device)
-        value = torch.expm1(self.decode(self.gather(self.prepare(samples)))).clamp_min(0.0)
+        batch = self.prepare(samples, self.config.interpolation)
+        value = torch.expm1(self.decode(self.gather(batch)).clamp_max(LOG_LIMIT)).clamp_min(0.0)
         return torch.where(above, value, 0.0)
 
     @torch.no_grad()
@@ -290,7 +296,7 @@ class NeuBRDF(nn.Module):
 
     def event_samples(self) -> int:
         """Return how many samples :meth:`begin` and :meth:`event` need to know every grid point."""
-        wanted = min(max(4096, 32 * self.config.points) * self.count, 1 << 19)
+        wanted = min(max(4096, 32 * self.points) * self.count, 1 << 19)
         whole = 4096 if wanted <= 16384 else 16384  # batches of one size
         return -(-wanted // whole) * whole
 
@@ -308,11 +314,12 @@ class NeuBRDF(nn.Module):
                 words[: len(live)] = features
             else:
                 metric = reassign.metric(self, batches, loss)[live]
-                words, index = vq.fit(features, metric, len(words), generator)
+                words, index = vq.fit(features.cpu(), metric.cpu(), len(words), generator)
             with torch.no_grad():
                 self.codebook.copy_(words)
                 self.indices[live] = index.to(self.indices)
                 self.quantised.fill_(True)
+            self._inherit()
 
     def enter(self, stage: dict) -> None:
         """Set what ``stage`` needs beyond the state that a checkpoint holds."""
@@ -322,6 +329,21 @@ class NeuBRDF(nn.Module):
         """Choose the primitive of every grid point anew; see :func:`warp_neumat.models.reassign.sweep`."""
         if int(self.live.sum()) > len(self.codebook):  # else every point has a primitive of its own
             reassign.sweep(self, list(batches()), loss)
+            self._inherit()
+
+    def _inherit(self) -> None:
+        """Give the points that are not stored the indices that a file gives them: their ancestors'."""
+        if self.config.pixelation != "healpix":
+            return
+        for material in range(self.count):
+            own = self._own(material)
+            live, indices = self.live[own].cpu().numpy(), self.indices[own].cpu().numpy()
+            full = np.asarray(expand(self.config.nside, live, indices[live]), np.int32)
+            self.indices[own] = torch.from_numpy(full).to(self.indices)
+
+    def _own(self, material: int) -> slice:
+        """Return where a material's points lie among all."""
+        return slice(material * 2 * self.points, (material + 1) * 2 * self.points)
 
     def _refine(self) -> None:
         nside, points = self.nside, self._points(self.nside)
@@ -347,14 +369,15 @@ class NeuBRDF(nn.Module):
         """Size of the features as they are or would be stored, without the decoder."""
         config = self.config
         storage = "vq" if config.storage == "codebook" else config.storage
-        return feature_bytes(self._points(config.nside), config.features, storage, config.bits)
+        return feature_bytes(self.points, config.features, storage, config.bits)
 
     def to_asset(self, material: int = 0) -> tuple[dict[str, np.ndarray], dict]:
         """Return (tensors, header) of the ``.neumat`` file: codebook and weights fp16, indices as a bit stream."""
         config = self.config
         if not self.has_file:
             raise ValueError(f"storage {config.storage} on {config.pixelation} is for comparison; it has no file")
-        tensors = {"codebook": self.codebook.detach().half().numpy(), **self.grids(material)}
+        rows = int(self.indices[self.live].max()) + 1  # primitives beyond them stand for nothing
+        tensors = {"codebook": self.codebook.detach()[:rows].half().numpy(), **self.grids(material)}
         for number, (weight, bias) in enumerate(self.layers(self.net.detach())):
             tensors[f"weight{number}"] = weight.half().contiguous().numpy()
             tensors[f"bias{number}"] = bias.half().numpy()
@@ -372,7 +395,7 @@ class NeuBRDF(nn.Module):
 
     def grids(self, material: int = 0) -> dict[str, np.ndarray]:
         """Return what is a material's own: ``indices``, and ``live`` where points are left out."""
-        own = slice(material * 2 * self.config.points, (material + 1) * 2 * self.config.points)
+        own = self._own(material)
         indices, live = self.indices[own].numpy(), self.live[own].numpy()
         if live.all():
             return {"indices": pack_bits(indices, self.config.bits)}
@@ -405,12 +428,13 @@ def from_asset(tensors: dict[str, np.ndarray], config: dict) -> NeuBRDF:
     points, bits = model.config.points, model.config.bits
     live = np.ones(2 * points, bool)
     if "live" in tensors:
-        raw = np.frombuffer(zlib.decompress(tensors["live"].tobytes()), np.uint8)
+        packed = zlib.decompressobj().decompress(tensors["live"].tobytes(), -(-2 * points // 8))
+        raw = np.frombuffer(packed, np.uint8)
         live = np.unpackbits(raw, bitorder="little", count=2 * points).astype(bool)
     indices = expand(model.config.nside, live, unpack_bits(tensors["indices"], bits, int(live.sum())))
     with torch.no_grad():
         model.level.fill_(len(model._levels) - 1)
-        model.codebook.copy_(torch.from_numpy(tensors["codebook"].astype(np.float32)))
+        model.codebook[: len(tensors["codebook"])] = torch.from_numpy(tensors["codebook"].astype(np.float32))
         model.indices.copy_(torch.from_numpy(np.asarray(indices, np.int32)))
         model.live.copy_(torch.from_numpy(live))
         model.quantised.fill_(True)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import dataclasses
 import difflib
 
-from warp_neumat.models.healpix_grid import point_count
-from warp_neumat.models.local_frame import FRAMES, INTERPOLATIONS, SYMMETRIES
+from warp_neumat.kernels.healpix import hemisphere_point_count
+from warp_neumat.kernels.neubrdf_frame import FRAMES, INTERPOLATIONS, SYMMETRIES
 
 STORAGES = ("codebook", "raw", "4bit")
 
@@ -41,12 +41,15 @@ class NeuBRDFConfig:
     """Grid of the directions; others than ``"healpix"`` are for comparison, and without a file."""
 
     def __post_init__(self):
-        object.__setattr__(self, "hidden", tuple(int(width) for width in self.hidden))
+        hidden = self.hidden if isinstance(self.hidden, (tuple, list)) else (self.hidden,)
+        object.__setattr__(self, "hidden", tuple(hidden))
         for name, low, high in (("nside", 1, 512), ("features", 4, 64), ("bits", 1, 16)):
             value = getattr(self, name)
             if not isinstance(value, int) or not low <= value <= high:
                 raise ValueError(f"{name} must be a whole number in [{low}, {high}], got {value!r}")
-        if not 1 <= len(self.hidden) <= 4 or any(width < 8 or width % 8 or width > 512 for width in self.hidden):
+        if not 1 <= len(self.hidden) <= 4 or any(
+            not isinstance(w, int) or w < 8 or w % 8 or w > 512 for w in self.hidden
+        ):
             raise ValueError(f"hidden must be 1 to 4 multiples of 8 up to 512, as 64,64, got {self.hidden}")
         for name, allowed in (
             ("interpolation", INTERPOLATIONS),
@@ -62,6 +65,8 @@ class NeuBRDFConfig:
             raise ValueError(f"symmetry {self.symmetry!r} needs frame half or half-isotropic, got frame {self.frame!r}")
         if self.symmetry == "bilateral" and self.frame != "half-isotropic":
             raise ValueError("symmetry 'bilateral' needs frame half-isotropic; use reciprocal")
+        if self.pixelation != "healpix" and self.interpolation != "bilinear":
+            raise ValueError(f"pixelation {self.pixelation!r} has weights of its own: leave out interpolation")
         if self.texture is not None:
             texture = tuple(self.texture)
             if len(texture) != 3 or not all(isinstance(v, int) and v >= 1 for v in texture) or texture[2] > 64:
@@ -71,7 +76,7 @@ class NeuBRDFConfig:
     @property
     def points(self) -> int:
         """Grid points of one hemisphere, with one ring beyond the equator."""
-        return point_count(self.nside)
+        return hemisphere_point_count(self.nside)
 
     @property
     def training_interpolation(self) -> str:
@@ -91,7 +96,8 @@ def configure(source, options: dict) -> NeuBRDFConfig:
     """
     fields = [field.name for field in dataclasses.fields(NeuBRDFConfig)]
     options = dict(options)
-    if options.pop("reciprocal", False) and options.setdefault("symmetry", "reciprocal") == "none":
+    reciprocal = options.pop("reciprocal", False)
+    if reciprocal and options.get("symmetry") == "none":
         raise ValueError("reciprocal and symmetry 'none' contradict each other: give one of them")
     for key in options:
         if key not in fields:
@@ -102,7 +108,11 @@ def configure(source, options: dict) -> NeuBRDFConfig:
     defaults: dict = {"frame": frame}
     if frame.startswith("half"):
         symmetry = getattr(source, "symmetry", "none")
-        defaults["symmetry"] = symmetry if isotropic or symmetry != "bilateral" else "reciprocal"
+        if symmetry == "bilateral" and frame != "half-isotropic" or reciprocal and symmetry == "none":
+            symmetry = "reciprocal"
+        defaults["symmetry"] = symmetry
+    elif reciprocal:
+        raise ValueError(f"reciprocal needs frame half or half-isotropic, got frame {frame!r}")
     if frame == "half-isotropic":
         defaults |= ISOTROPIC
     if getattr(source, "samples", None) is not None and frame.startswith("half"):

@@ -13,6 +13,7 @@ import torch
 from torch.nn.functional import embedding_bag
 
 from warp_neumat.kernels import dispatch
+from warp_neumat.kernels.neubrdf import LOG_LIMIT
 from warp_neumat.models import codebook as vq
 from warp_neumat.models.healpix_grid import colours
 from warp_neumat.ops.brdf import BRDFStep
@@ -44,7 +45,7 @@ def metric(model, batches, loss) -> torch.Tensor:
     result = model.table.new_zeros(total, k * k)
     for batch in batches:
         inputs = model.gather(batch).detach().requires_grad_()
-        residual = loss.residual(torch.expm1(model.decode(inputs).clamp_max(16.0)), batch)
+        residual = loss.residual(torch.expm1(model.decode(inputs).clamp_max(LOG_LIMIT)), batch)
         jacobian = [torch.autograd.grad(residual[:, c].sum(), inputs, retain_graph=c < 2)[0] for c in range(3)]
         jacobian = torch.stack([j[:, : 2 * k] for j in jacobian], 2).view(-1, 2, k, 3)
         square = (jacobian @ jacobian.transpose(2, 3)).view(-1, k * k)
@@ -62,7 +63,7 @@ def gradient(model, batches, loss, backward: bool = True) -> tuple[torch.Tensor,
     pulls, error = model.table.new_zeros(total, k), model.table.new_zeros(total, 1)
     for batch in batches:
         inputs = model.gather(batch).detach().requires_grad_(backward)
-        residual = loss.residual(torch.expm1(model.decode(inputs).clamp_max(16.0)), batch)
+        residual = loss.residual(torch.expm1(model.decode(inputs).clamp_max(LOG_LIMIT)), batch)
         corner, weight = _corners(batch)
         square = residual.detach().square().sum(1, keepdim=True).repeat_interleave(2, 0)
         _scatter(error, corner, (weight > 0).float(), square)
@@ -116,15 +117,17 @@ def sweep(model, batches, loss) -> None:
         probe = Probe(model, batches, loss)
     else:
         probe = functools.partial(gradient, model, batches, loss)
-    words, points = model.codebook.detach(), model.config.points
+    words, points = model.codebook.detach(), model.points
     # The metric saw a part of the samples that the gradient sees.
     local_metric *= len(batches) / len(batches[:METRIC_BATCHES])
     size = local_metric.diagonal(dim1=1, dim2=2).mean(1)
     number = torch.arange(len(model.indices), device=words.device)
-    side, colour = number // points % 2, colours(model.config.nside).to(words.device)[number % points]
+    side, colour = number // points % 2, number % 4
+    if model.config.pixelation == "healpix":
+        colour = colours(model.config.nside).to(words.device)[number % points]
     eye = torch.eye(model.config.features, device=words.device)
     for part in range(8):
-        live = torch.nonzero((size > 0) & (side == part // 4) & (colour == part % 4)).flatten()
+        live = torch.nonzero(model.live & (size > 0) & (side == part // 4) & (colour == part % 4)).flatten()
         if not len(live):
             continue
         pull, error = probe()

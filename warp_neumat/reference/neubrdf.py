@@ -190,5 +190,5 @@ def reference_eval(
         x = x @ tensors[f"weight{layer}"].astype(np.float64).T + tensors[f"bias{layer}"].astype(np.float64)
         if layer < layers:
             x = np.maximum(x, 0.0)
-    values[above] = np.maximum(np.expm1(x), 0.0)
+    values[above] = np.maximum(np.expm1(np.minimum(x, 11.0)), 0.0)
     return values

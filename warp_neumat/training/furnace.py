@@ -126,11 +126,6 @@ def energy(asset_fn, source_fn, *, isotropic: bool = True) -> dict[str, float]:
     }
 
 
-def excess(asset_fn, source_fn, *, isotropic: bool = True) -> float:
-    """Return ``albedo_excess`` of :func:`energy`."""
-    return energy(asset_fn, source_fn, isotropic=isotropic)["albedo_excess"]
-
-
 def reciprocity_error(eval_fn, *, samples: tuple[int, int] = SAMPLES) -> float:
     """Return how far f(ω_i, ω_o) is from f(ω_o, ω_i), relative, weighted by the energy that each pair carries.
 

@@ -106,7 +106,9 @@ class Trainer:
         self._last_tick = now
 
     def _position(self, stage: dict) -> float:
-        """How far the stage is, 0 … 1: by steps, or by time where there is a budget."""
+        """How far the stage is, 0 … 1: by steps, or by time where there is a budget; without a share, over."""
+        if stage["share"] == 0.0:
+            return 1.0
         if self.plan.budget_seconds is None:
             return self._step / max(1, round(self.plan.steps * stage["share"]))
         self._tick()
@@ -145,12 +147,25 @@ class Trainer:
             optimiser.step()
             self._step += 1
             if within == CHUNK - 1:
-                self.last_loss = float(loss)
-                if not math.isfinite(self.last_loss):
-                    raise FloatingPointError(f"the fit diverged in stage {name} at step {self._step}; try another seed")
+                self._note(stage, loss)
                 self._report(stage, f"{name}: loss {self.last_loss:.4f}")
-        self.last_loss = float(loss) if chunk is not None else self.last_loss
+        if chunk is not None:
+            self._note(stage, loss)
+        while self._event < stage["events"]:  # a short stage ends before they are due
+            self._take_stock(stage)
         self._tick()
+
+    def _note(self, stage, loss) -> None:
+        self.last_loss = float(loss)
+        if not math.isfinite(self.last_loss):
+            raise FloatingPointError(
+                f"the fit diverged in stage {stage['name']} at step {self._step}; try another seed"
+            )
+
+    def _take_stock(self, stage) -> None:
+        self._event += 1
+        self._report(stage, f"{stage['name']}: taking stock {self._event}/{stage['events']}")
+        self.model.event(stage, lambda: self._event_batches(self._event), self.loss)
 
     def _shuffled(self, chunk) -> dict[str, torch.Tensor]:
         """Return a chunk in another order: runs of 64 samples are moved as they are, at the speed of memory."""
@@ -164,9 +179,7 @@ class Trainer:
         self._tick()
         # The last quarter of a stage is free of events, to settle.
         while self._event < stage["events"] and position >= 0.75 * self._event / stage["events"]:
-            self._event += 1
-            self._report(stage, f"{stage['name']}: taking stock {self._event}/{stage['events']}")
-            self.model.event(stage, lambda: self._event_batches(self._event), self.loss)
+            self._take_stock(stage)
         if self.checkpoint is not None and time.monotonic() - self._last_save >= self.plan.checkpoint_seconds:
             self._tick()
             self._save(optimiser, parameters)

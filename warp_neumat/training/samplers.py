@@ -64,7 +64,7 @@ class BRDFSampler:
         wi = np.empty_like(wo)
         cosine = count - grazing - peak
         wi[:cosine] = _projected(cosine, rng)
-        wi[cosine:-grazing] = _mirrored(wo[cosine : count - grazing], rng)
+        wi[cosine : count - grazing] = _mirrored(wo[cosine : count - grazing], rng)
         split = count - grazing // 2
         wi[count - grazing : split] = _mirrored(wo[count - grazing : split], rng)
         wi[split:] = _projected(count - split, rng, 1.0)
