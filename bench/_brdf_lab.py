@@ -117,6 +117,7 @@ class Lab:
             "steps": choice.baseline_steps if baseline else choice.steps,
             "seed": choice.seed,
             "size": choice.size,
+            "fit": None if baseline else _defaults(source, options),
         }
         key = hashlib.sha256(json.dumps(request, sort_keys=True).encode()).hexdigest()[:16]
         drawn = choice.picture is None or (material, method) in self.spheres or method not in (*BASELINES, *OURS)
@@ -179,6 +180,15 @@ class Lab:
         """Return the mean of every figure that all records have."""
         keys = [k for k in FIGURES if all(isinstance(r.get(k), (int, float)) for r in records)]
         return {k: float(np.mean([r[k] for r in records])) for k in keys}
+
+
+def _defaults(source, options: dict) -> dict:
+    """Return what a fit with ``options`` resolves to: records of other defaults are not those of today's."""
+    from warp_neumat.models import neubrdf
+    from warp_neumat.training.loop import Plan
+
+    config = dataclasses.asdict(neubrdf.configure(source, options))
+    return {"config": config, "steps": neubrdf.DEFAULT_STEPS, "batch": Plan.batch, "version": neubrdf.VERSION}
 
 
 def _file(name: str) -> Path:

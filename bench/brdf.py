@@ -64,7 +64,7 @@ AXES = {
 
 def misses(record: dict) -> bool:
     """Return whether a record misses one of :data:`GOAL`."""
-    return not (record["mae"] <= GOAL["mae"] and record.get("ssim", 0.0) >= GOAL["ssim"])
+    return not (record["mae"] <= GOAL["mae"] and (record.get("ssim") or 0.0) >= GOAL["ssim"])
 
 
 def table1(lab: Lab):

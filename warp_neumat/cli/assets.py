@@ -31,7 +31,8 @@ def fit(
         str,
         typer.Argument(
             help="A folder of PBR maps or its .json manifest (model bcf); a MERL .binary, an RGL .bsdf, a .csv of "
-            "samples, FILE.npz:NAME, analytic:ggx?roughness=0.2&f0=0.9,0.6,0.3 or analytic:layered?… (model neubrdf). "
+            "samples, FILE.npz:NAME, analytic:ggx?roughness=0.2&f0=0.9,0.6,0.3, analytic:layered?… or "
+            "svbrdf:FOLDER, PBR maps as a reflectance (model neubrdf). "
             "With --shared also FILE.npz, FILE.npz:'gold*', or a folder of measured files."
         ),
     ],
@@ -48,7 +49,10 @@ def fit(
     ] = None,
     features: Annotated[
         str | None,
-        typer.Option(help="Longer sides of the feature textures instead of a preset, as 256,128,64,32 [texel]."),
+        typer.Option(
+            help="bcf: longer sides of the feature textures instead of a preset, as 256,128,64,32 [texel]; neubrdf: "
+            "width of a primitive, as 16."
+        ),
     ] = None,
     budget: Annotated[
         int | None, typer.Option("--bytes", min=1, help="Sizes of the feature textures by what they may take [byte].")
@@ -104,6 +108,9 @@ def fit(
     if groups is not None and shared is None:
         raise Usage("--groups is for --shared")
     config = parse_options(option or [], _OWN)
+    for name, stored in (("storage", "codebook"), ("pixelation", "healpix")):
+        if config.get(name, stored) != stored:
+            raise Usage(f"--option {name}={config[name]} is for comparison and has no file; see python -m bench.brdf")
     if reciprocal:
         config["reciprocal"] = True
     opening = {
@@ -127,13 +134,18 @@ def fit(
         raise Usage(f"--reciprocal is for model neubrdf, not {model}")
     if preset is not None:
         one_of("--preset", preset, training.presets(model))
+    if model == "neubrdf" and features is not None and len(config["features"]) == 1:
+        config["features"], opening["features"] = config["features"][0], None  # the width of a primitive
+    textured = model == "neubrdf" and source.startswith("svbrdf:")
     for name in opening if model != "bcf" else ():
+        if textured and name in ("size", "crop", "overrides"):
+            continue
         if opening[name] is not None:
             raise Usage(f"--{name.removesuffix('s') if name == 'overrides' else name} is for model bcf, not {model}")
 
     start = time.perf_counter()
     if shared is not None:
-        _fit_shared(source, shared, groups, preset, steps, seed, resume, config)
+        _fit_shared(source, shared, groups, preset, steps, seed, resume, device, config)
         print(f"{shared}: {time.perf_counter() - start:.0f} s")
         return
     with progress_bar(f"fit {out.stem}") as progress:
@@ -153,21 +165,20 @@ def fit(
     print(f"{out}: {_figures(header.get('metrics', {}))} ({time.perf_counter() - start:.0f} s)")
 
 
-def _fit_shared(source, folder: Path, groups, preset, steps, seed, resume, config) -> None:
+def _fit_shared(source, folder: Path, groups, preset, steps, seed, resume, device, config) -> None:
     from warp_neumat.io.brdf_set import open_brdfs
-    from warp_neumat.models.neubrdf import DEFAULT_STEPS
     from warp_neumat.training.fit import PRESETS
     from warp_neumat.training.sharing import fit_shared
 
-    if preset is not None and steps is None:
-        steps = round(PRESETS[one_of("--preset", preset, PRESETS)] * DEFAULT_STEPS)
     with progress_bar(f"fit {folder.name}") as progress:
         headers = fit_shared(
             open_brdfs(source),
             folder,
             count=groups,
             steps=steps,
+            length=PRESETS[preset or "standard"],
             seed=seed,
+            device=device,
             resume=resume,
             progress=progress,
             announce=lambda text: print(text, flush=True),
@@ -234,16 +245,29 @@ def evaluate(
 
 
 def _evaluate_brdf(material, against: str, picture: Path | None) -> tuple[dict, str]:
-    from warp_neumat.io.brdf import open_brdf
+    from warp_neumat.io.svbrdf import PREFIX, is_spatial
+    from warp_neumat.training import spatial
     from warp_neumat.training.evaluate import brdf_metrics, sphere_strip
+    from warp_neumat.training.fit import BRDFData
+    from warp_neumat.training.plane import plane_strip
 
-    source = open_brdf(against)
-    record = {"kind": material.kind, "bytes": material.bytes, **brdf_metrics(source, material.brdf)}
+    opening = material.header.get("source", {}).get("opening", {}) if against.startswith(PREFIX) else {}
+    source = BRDFData.open(against, **{k: opening[k] for k in BRDFData.OPTIONS if k in opening})
+    varies = is_spatial(source)
+    if material.textured and not varies:
+        raise Usage(f"{material.name} varies over a surface; --against must be {PREFIX}FOLDER, got {against!r}")
+    evaluate = spatial.material_on_source_levels(source, material) if varies else material.brdf
+    record = {"kind": material.kind, "bytes": material.bytes, **brdf_metrics(source, evaluate)}
+    if varies:
+        record["bits_per_texel"] = spatial.bits_per_texel(source, material.bytes)
     if picture is not None:
         from warp_neumat.io.image import write_png
 
-        write_png(picture, sphere_strip(source.eval, material.brdf))
-    return record, ""
+        write_png(picture, plane_strip(source, evaluate) if varies else sphere_strip(source.eval, evaluate))
+    return record, "\n".join(
+        f"level {mip['lod']}: {_figures({k: v for k, v in mip.items() if k != 'lod'})}"
+        for mip in record.get("mips", ())
+    )
 
 
 def _evaluate_maps(material, against: str, baselines, picture: Path | None) -> tuple[dict, str]:

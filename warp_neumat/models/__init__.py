@@ -6,7 +6,7 @@ What :mod:`warp_neumat.training` relies on, of every module: ``DATA`` (kind of s
 
 Models of reflectance functions (``DATA = "brdf"``) are trained by :mod:`warp_neumat.training.loop` and further have
 ``from_asset(tensors, config)``, ``prepare(samples) -> batch``, ``predict(batch)``, ``event_samples()``, ``stages()``,
-``trainable(stage)``, ``begin``, ``enter``, ``event`` and ``evaluate(*inputs)``;
+``trainable(stage)``, ``rates(parameters)``, ``begin``, ``enter``, ``event`` and ``evaluate(*inputs)``;
 :class:`warp_neumat.models.neubrdf.NeuBRDF` says what each does. Models of texture sets (``"maps"``) are trained by
 :mod:`warp_neumat.training.block_loop`, which knows the buffers of :class:`warp_neumat.models.bcf.BCf`.
 """

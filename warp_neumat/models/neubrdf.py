@@ -89,6 +89,8 @@ class NeuBRDF(nn.Module):
         self.register_buffer("quantised", torch.tensor(False))
         self.rounded = False
         self.net = nn.Parameter(self._initial_net(generator))
+        self.support: tuple[torch.Tensor, torch.Tensor] | None = None
+        """ω_i and ω_o, (n, 3) each, of every sample of a source that is a list: the points they touch are stored."""
         self._step = None
 
     def _points(self, nside: int) -> int:
@@ -294,6 +296,10 @@ class NeuBRDF(nn.Module):
         own = self.codebook if self.quantised else self.table
         return [own, self.net, *([] if self.texture is None else [self.texture.texels])]
 
+    def rates(self, parameters) -> list[float]:
+        """Return the factors of the learning rate: texels are seen by few samples each, and take longer steps."""
+        return [1.0, 1.0, 3.0][: len(parameters)]
+
     def event_samples(self) -> int:
         """Return how many samples :meth:`begin` and :meth:`event` need to know every grid point."""
         wanted = min(max(4096, 32 * self.points) * self.count, 1 << 19)
@@ -307,6 +313,11 @@ class NeuBRDF(nn.Module):
         if stage["kind"] == "codebook":
             batches = list(batches())
             self._observe(batches)
+            if self.support is not None:
+                wi, wo = self.support
+                self._observe(
+                    self.prepare({"wi": i, "wo": o}) for i, o in zip(wi.split(65536), wo.split(65536), strict=True)
+                )
             live = torch.nonzero(self.live).flatten()
             features, words = self.table.detach()[live], torch.zeros_like(self.codebook)
             if len(live) <= len(words):  # a primitive for every point

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from warp_neumat.io.svbrdf import is_spatial
 from warp_neumat.training.furnace import energy, reciprocity_error
+from warp_neumat.training.plane import plane_metrics
 from warp_neumat.training.samplers import measured_directions
 from warp_neumat.training.sphere import render_sphere, sphere_error, tone_map
 
@@ -15,12 +17,18 @@ def brdf_metrics(source, eval_fn, *, size: int = 256) -> dict:
     Args:
         source: The BRDF source.
         eval_fn: The asset's ``(wi, wo) -> (N, 3)``, value without the cosine in 1/sr.
+        size: Side of the picture in pixels.
+
+    A source that varies over a surface has :func:`warp_neumat.training.plane.plane_metrics` instead, and an ``eval_fn``
+    of ``(uv, lod, wi, wo)``.
 
     ``mse_raw`` is the mean squared error of the BRDF values themselves, in 1/sr², on 2¹⁷ directions spaced as a MERL
     table is; mirror peaks of several hundred decide it, so ``mse_log`` is that of log(1 + f) there. The
     sphere is that of :func:`warp_neumat.training.sphere.render_sphere`. ``albedo_max``, ``albedo_max_source``,
     ``albedo_excess`` and ``reciprocity`` are those of :mod:`warp_neumat.training.furnace`.
     """
+    if is_spatial(source):
+        return plane_metrics(source, eval_fn, size=size)
     error = sphere_error(render_sphere(eval_fn, size), render_sphere(source.eval, size))
     wi, wo = measured_directions(1 << 17, np.random.default_rng(0))
     fitted, expected = np.asarray(eval_fn(wi, wo), np.float64), source.eval(wi, wo).astype(np.float64)

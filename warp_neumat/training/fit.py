@@ -17,12 +17,13 @@ import numpy as np
 import torch
 
 from warp_neumat import models
+from warp_neumat.io import svbrdf
 from warp_neumat.io.asset import write_asset
 from warp_neumat.io.atomic import check_writable
 from warp_neumat.io.brdf import open_brdf
 from warp_neumat.io.texture_set import open_texture_set
 from warp_neumat.materials.bcf import BCf as BCfMaterial
-from warp_neumat.training import losses, samplers
+from warp_neumat.training import losses, samplers, spatial
 from warp_neumat.training.block_loop import BlockTrainer
 from warp_neumat.training.evaluate import brdf_metrics
 from warp_neumat.training.evaluate_maps import sample_grid
@@ -33,49 +34,78 @@ PRESETS = {"quick": 0.3, "standard": 1.0, "fine": 4.0}
 
 
 class BRDFData:
-    """What a fit does with sources of kind ``brdf``; the pattern for other kinds."""
+    """What a fit does with sources of kind ``brdf``, varying over a surface or not; the pattern for others."""
 
-    OPTIONS = ()
+    OPTIONS = ("size", "crop", "overrides")
     """Keyword arguments of :func:`fit` that belong to the source."""
-    open = staticmethod(open_brdf)
     loss = staticmethod(losses.LogCosine)
+
+    @staticmethod
+    def open(source, **opening):
+        """Return the source that ``source`` names."""
+        if str(source).startswith(svbrdf.PREFIX):
+            return svbrdf.open_svbrdf(source, **opening)
+        if opening:
+            name = next(iter(opening))
+            raise ValueError(f"{name} is for maps: {svbrdf.PREFIX}FOLDER, or model bcf; {source} has no {name}")
+        return open_brdf(source)
 
     @staticmethod
     def configured(module, source, preset, options):
         """Return (length factor, batch, config of the model)."""
+        if svbrdf.is_spatial(source):
+            options = spatial.configured(source, options)
+        elif options.get("texture") is not None:
+            raise ValueError(f"texture is for what varies over a surface, as {svbrdf.PREFIX}FOLDER; leave it out")
         return _length(preset, PRESETS), Plan.batch, module.configure(source, options)
 
     @staticmethod
-    def sampler(source):
+    def sampler(source, texture=None):
         """Return ``sampler(rng, count)`` for :class:`warp_neumat.training.loop.Trainer`."""
+        if svbrdf.is_spatial(source):
+            return lambda rng, count: spatial.SpatialSampler(source, rng, texture).draw(count)
         return lambda rng, count: samplers.sampler(source, rng).draw(count)
 
     @staticmethod
     def opening(source, arguments: dict) -> dict:
         """Return what the header keeps of how the source was opened, JSON-able."""
-        return {}
+        return dict(getattr(source, "opening", {}))
 
     @staticmethod
     def described(source, shape) -> str:
         """Return what was understood of the source and what will be made of it, for people; may be empty."""
-        return ""
+        notes = "".join(f"note: {note}\n" for note in getattr(source, "notes", ()))
+        if source.isotropic is False and shape.frame.endswith("isotropic"):
+            notes += f"note: {source.name} is anisotropic; frame {shape.frame} leaves that out\n"
+        if not svbrdf.is_spatial(source):
+            return notes.rstrip()
+        made = "none" if shape.texture is None else "×".join(map(str, shape.texture))
+        return f"{notes}{source.name}: {source.width}×{source.height} texels; neural texture: {made}"
 
     @classmethod
     def trainer(cls, module, source, shape, plan, device, **more):
         """Return what ``run`` and ``resume`` are called on."""
         trained = module.build(shape, plan.seed).to(device)
-        return Trainer(trained, cls.sampler(source), cls.loss(), plan, **more)
+        if getattr(source, "samples", None) is not None:
+            trained.support = tuple(torch.from_numpy(d).to(device) for d in source.samples[:2])
+        return Trainer(trained, cls.sampler(source, shape.texture), cls.loss(), plan, **more)
 
     @staticmethod
     def stored(module, source, trainer) -> tuple[dict, dict, dict]:
         """Return (tensors, header, metrics) of the trained model, measured on what will be stored."""
         model = trainer.model.cpu()
-        if not model.has_file:
-            header = {"kind": "neubrdf", "version": module.VERSION, "config": dataclasses.asdict(model.config)}
-            return {}, header, {**brdf_metrics(source, model.evaluate), "bytes": model.bytes}
-        tensors, header = model.to_asset()
-        metrics = brdf_metrics(source, module.from_asset(tensors, header["config"]).evaluate)
-        return tensors, header, metrics
+        if model.has_file:
+            tensors, header = model.to_asset()
+            config, size = header["config"], sum(t.nbytes for t in tensors.values())
+            evaluate, rate = module.from_asset(tensors, config).evaluate, {}
+        else:
+            config, size, tensors = dataclasses.asdict(model.config), model.bytes, {}
+            header = {"kind": "neubrdf", "version": module.VERSION, "config": config}
+            evaluate, rate = model.evaluate, {"bytes": size}
+        if svbrdf.is_spatial(source):
+            evaluate = spatial.on_source_levels(source, config["texture"], evaluate)
+            rate["bits_per_texel"] = spatial.bits_per_texel(source, size)
+        return tensors, header, {**brdf_metrics(source, evaluate), **rate}
 
 
 class MapData:
@@ -143,10 +173,13 @@ DATA = {"brdf": BRDFData, "maps": MapData}
 
 
 def default_model(source) -> str:
-    """Return the model that a source is for: ``neubrdf`` for ``FILE.npz…`` and ``KIND:…``, else ``bcf``."""
+    """Return the model that a source is for: ``neubrdf`` for measured files and ``KIND:…``, else ``bcf``."""
+    if str(source).startswith(svbrdf.PREFIX):
+        return "neubrdf"
     if isinstance(source, dict) or str(source).lower().endswith(".json") or os.path.isdir(source):
         return "bcf"
-    return "neubrdf" if ":" in str(source) or str(source).lower().endswith(".npz") else "bcf"
+    file = str(source).lower().partition("?")[0]
+    return "neubrdf" if ":" in str(source) or file.endswith((".npz", ".binary", ".bsdf", ".csv")) else "bcf"
 
 
 def presets(model: str) -> tuple[str, ...]:
@@ -182,7 +215,8 @@ def fit(
     Args:
         source: As for :func:`warp_neumat.io.brdf.open_brdf`, or for model ``bcf`` as for
             :func:`warp_neumat.io.texture_set.open_texture_set`.
-        out: The ``.neumat`` file to write; replaced if it exists. Its folder must exist.
+        out: The ``.neumat`` file to write; replaced if it exists. Its folder must exist. A config that is for comparison
+            alone (``storage``, ``pixelation``) is fitted and measured, and nothing is written.
         model: Name in :data:`warp_neumat.models.REGISTRY`; default: :func:`default_model`.
         steps: Optimiser steps; default: the model's, times the preset's factor.
         seed: Same seed, same file (on one machine with the same number of threads).
@@ -232,6 +266,8 @@ def fit(
         tensors, header, metrics = kind.stored(module, opened, trainer)
         size = sum(tensor.nbytes for tensor in tensors.values())
         header["source"] = {"spec": _named(source), "name": opened.name}
+        if notes := list(getattr(opened, "notes", ())):
+            header["source"]["notes"] = notes
         if settled:
             header["source"]["opening"] = settled
         seconds = facts.pop("seconds")  # returned, but not stored: the same seed gives the same file
@@ -244,7 +280,7 @@ def fit(
         torch.set_num_threads(threads)
     checkpoint_path(out).unlink(missing_ok=True)
     if progress:
-        progress(1.0, f"wrote {out}")
+        progress(1.0, f"wrote {out}" if tensors else "measured; for comparison alone, so nothing is written")
     return header
 
 

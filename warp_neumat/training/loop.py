@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from warp_neumat.kernels import dispatch
 from warp_neumat.training import checkpoint
 
 CHUNK = 32
@@ -126,7 +127,8 @@ class Trainer:
             self.model.begin(stage, lambda: self._event_batches(0), self.loss, generator)
         self.model.enter(stage)
         parameters = self.model.trainable(stage)
-        optimiser = torch.optim.Adam(parameters, lr=stage["lr"][0], betas=(0.9, 0.99), eps=1e-10, fused=True)
+        groups, rates = [{"params": [p]} for p in parameters], self.model.rates(parameters)
+        optimiser = torch.optim.Adam(groups, lr=stage["lr"][0], betas=(0.9, 0.99), eps=1e-10, fused=True)
         if self._pending is not None:
             checkpoint.restore_optimiser(optimiser, parameters, self._pending)
             self._pending = None
@@ -141,7 +143,8 @@ class Trainer:
             start = within % CHUNK * self.plan.batch
             batch = {key: value[start : start + self.plan.batch] for key, value in chunk.items()}
             high, low = stage["lr"]
-            optimiser.param_groups[0]["lr"] = low + (high - low) * 0.5 * (1.0 + math.cos(math.pi * position))
+            for group, rate in zip(optimiser.param_groups, rates, strict=True):
+                group["lr"] = rate * (low + (high - low) * 0.5 * (1.0 + math.cos(math.pi * position)))
             optimiser.zero_grad(set_to_none=True)
             loss = self.model.gradients(batch, self.loss)
             optimiser.step()
@@ -189,7 +192,7 @@ class Trainer:
 
     def _facts(self) -> dict:
         plan = {k: v for k, v in dataclasses.asdict(self.plan).items() if k != "checkpoint_seconds"}
-        return {"plan": plan, **self.identity}
+        return {"plan": plan, "threads": dispatch.worker_count(), **self.identity}
 
     def _save(self, optimiser, parameters) -> None:
         tensors = {f"model.{name}": value for name, value in self.model.state_dict().items()}
