@@ -22,6 +22,7 @@ LAYOUTS = {
     "isotropic-idw": {"frame": "isotropic", "interpolation": "idw", "hidden": (16,)},
     "half-none-uniform": {"frame": "half", "interpolation": "uniform", "hidden": (16, 24, 8)},
     "half-reciprocal": {"frame": "half", "symmetry": "reciprocal", "hidden": (16,), "keep": 0.1},
+    "half-light": {"frame": "half-light", "hidden": (16,), "texture": (3, 4, 4, 2)},
     "half-isotropic-bilateral": {"frame": "half-isotropic", "symmetry": "bilateral"},
     "half-isotropic-bilateral-idw": {
         "frame": "half-isotropic", "symmetry": "bilateral", "interpolation": "idw", "hidden": (16,),

@@ -35,7 +35,7 @@ def random_model(frame, rng, **options):
     return model
 
 
-@pytest.mark.parametrize("frame", ["absolute", "isotropic", "half", "half-isotropic"])
+@pytest.mark.parametrize("frame", ["absolute", "isotropic", "half", "half-isotropic", "half-light"])
 @pytest.mark.parametrize(
     "shape",
     [
@@ -228,7 +228,7 @@ def test_asset_layout(rng):
         ({"nside": 0}, r"nside must be a whole number in \[1, 512\]"),
         ({"bits": 17}, "bits must be"),
         ({"hidden": (64, 20)}, "hidden must be 1 to 4 multiples of 8"),
-        ({"frame": "iso"}, "frame must be one of absolute, isotropic, half, half-isotropic"),
+        ({"frame": "iso"}, "frame must be one of absolute, isotropic, half, half-isotropic, half-light"),
         ({"frame": "absolute", "symmetry": "reciprocal"}, "symmetry 'reciprocal' needs frame half"),
         ({"frame": "half", "symmetry": "bilateral"}, "needs frame half-isotropic"),
         ({"reciprocal": True, "symmetry": "none"}, "contradict each other"),

@@ -258,6 +258,9 @@ def _evaluate_brdf(material, against: str, picture: Path | None) -> tuple[dict, 
         raise Usage(f"{material.name} varies over a surface; --against must be {PREFIX}FOLDER, got {against!r}")
     evaluate = spatial.material_on_source_levels(source, material) if varies else material.brdf
     record = {"kind": material.kind, "bytes": material.bytes, **brdf_metrics(source, evaluate)}
+    if (own := material.header.get("own_bytes")) is not None:
+        sharers = material.header.get("metrics", {}).get("sharers")
+        record |= {"bytes_own": own, "bytes_shared": material.bytes - own, "sharers": sharers}
     if varies:
         record["bits_per_texel"] = spatial.bits_per_texel(source, material.bytes)
     if picture is not None:

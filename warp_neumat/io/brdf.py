@@ -23,6 +23,7 @@ FORMS = {
     "FILE.bsdf": "RGL tensor file, RGB or spectral",
     "FILE.csv": "sparse samples (options isotropic=0|1, symmetry=none|reciprocal|bilateral)",
     "analytic:MODEL?KEY=VALUE&…": "ggx, layered or lambert",
+    "svbrdf:FOLDER": "PBR maps as a reflectance that varies in space",
 }
 """Every form of a source that :func:`open_brdf` knows, with what it is."""
 

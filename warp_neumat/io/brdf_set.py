@@ -6,14 +6,24 @@ import fnmatch
 import re
 import zipfile
 from pathlib import Path
+from typing import NamedTuple
 
 from warp_neumat.io.brdf import open_brdf
+from warp_neumat.io.brdf_source import BRDFSource
 
 SUFFIXES = (".binary", ".bsdf", ".csv")
 """Files of a folder that are taken for sources."""
 
 
-def open_brdfs(spec: str) -> dict[str, object]:
+class Opened(NamedTuple):
+    """A source, and what it was opened by."""
+
+    spec: str
+    """What :func:`warp_neumat.io.brdf.open_brdf` opens the same source by."""
+    source: BRDFSource
+
+
+def open_brdfs(spec: str) -> dict[str, Opened]:
     """Return the sources that ``spec`` names, by a name that can be a file's.
 
     Args:
@@ -33,7 +43,7 @@ def open_brdfs(spec: str) -> dict[str, object]:
     match = re.fullmatch(r"(?P<file>.+\.npz)(:(?P<pattern>[^:/\\]*))?", spec, flags=re.IGNORECASE | re.DOTALL)
     if not match or (match["pattern"] and not re.search(r"[*?\[]", match["pattern"])):
         source = open_brdf(spec)
-        return {_file_name(source.name): source}
+        return {_file_name(source.name): Opened(spec, source)}
     file, pattern = Path(match["file"]), match["pattern"] or "*"
     if not file.is_file():
         raise FileNotFoundError(f"{file}: no such file; give the path of an .npz with BRDF functions")
@@ -48,12 +58,12 @@ def open_brdfs(spec: str) -> dict[str, object]:
     return _named([(name, f"{file}:{name}") for name in chosen])
 
 
-def _named(pairs) -> dict[str, object]:
-    found: dict[str, object] = {}
+def _named(pairs) -> dict[str, Opened]:
+    found: dict[str, Opened] = {}
     for name, spec in pairs:
         if _file_name(name) in found:
             raise ValueError(f"{spec}: a second source named {_file_name(name)!r}; rename one of them")
-        found[_file_name(name)] = open_brdf(spec)
+        found[_file_name(name)] = Opened(spec, open_brdf(spec))
     return found
 
 

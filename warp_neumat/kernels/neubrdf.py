@@ -188,7 +188,7 @@ def functions(layout: Layout, lanes: int, single: bool = False) -> types.SimpleN
     VIEW = 4 * (sides - 1) * L  # where ω_o's corners lie: behind ω_i's, or in their place until the light comes
     FLOAT = wp.constant(wp.uint64(4))
     corners = corner_function(layout.interpolation)
-    half_frame = make_half_frame(layout.frame == "half-isotropic", layout.symmetry)
+    half_frame = make_half_frame(layout.frame, layout.symmetry)
 
     @wp.func_native(neubrdf_code.view_code(H1, lanes, uniform))
     def view_sums(

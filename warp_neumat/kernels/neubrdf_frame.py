@@ -24,7 +24,7 @@ from warp_neumat.kernels.healpix_chart import chart, square
 
 wp.set_module_options(module_options())
 
-FRAMES = ("absolute", "isotropic", "half", "half-isotropic")
+FRAMES = ("absolute", "isotropic", "half", "half-isotropic", "half-light")
 """Frames by name."""
 
 SYMMETRIES = ("none", "reciprocal", "bilateral")
@@ -47,8 +47,10 @@ def azimuth_of(x: float, y: float):
 
 
 @functools.cache
-def make_half_frame(isotropic: bool, symmetry: str):
+def make_half_frame(frame: str, symmetry: str):
     """Return a Warp function (ω_i, ω_o) → (warped half vector, difference vector) of unit directions with z ≥ 0.
+
+    ``"half-light"`` gives ω_i in place of the difference vector.
 
     The difference vector is taken from (ω_i − ω_o)/2 and |ω_i + ω_o|/2 rather than from ω_i alone: equal in exact
     arithmetic, and swapping the two then negates it to the last bit, so that a symmetric material is reciprocal to the
@@ -93,10 +95,12 @@ def make_half_frame(isotropic: bool, symmetry: str):
         gz = hz / wp.sqrt(1.0 + s)
         gx = wp.sqrt(s)
         gy = 0.0
-        if wp.static(not isotropic):
+        if wp.static(frame != "half-isotropic"):
             q = 1.0 / wp.sqrt(wp.max(s, 1.0e-12))
             gx = hx * q
             gy = hy * q
+        if wp.static(frame == "half-light"):
+            return wp.vec3(gx, gy, gz), wi
         return wp.vec3(gx, gy, gz), wp.vec3(dx, dy, dz)
 
     return half_frame

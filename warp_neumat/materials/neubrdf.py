@@ -178,7 +178,7 @@ def _checked(config, path) -> dict:
     result["symmetry"] = _word(config, "symmetry", SYMMETRIES, path, "none")
     result["interpolation"] = _word(config, "interpolation", INTERPOLATIONS, path, "bilinear")
     _word(config, "output", ("expm1",), path, "expm1")
-    if result["symmetry"] != "none" and not result["frame"].startswith("half"):
+    if result["symmetry"] != "none" and result["frame"] not in ("half", "half-isotropic"):
         rule = f"{result['symmetry']} needs a half frame, but config.frame is {result['frame']}"
         raise FormatError(path, "config.symmetry", rule, _AGAIN)
     texture = config.get("texture")

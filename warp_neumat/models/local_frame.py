@@ -15,6 +15,8 @@ def to_local_frame(wi: torch.Tensor, wo: torch.Tensor, frame: str, symmetry: str
     - ``isotropic``: both turned about z until ω_o has azimuth 0, ω_i then mirrored to y ≥ 0.
     - ``half``: half vector, its polar angle stretched near the pole (sin θ' = √sin θ), and difference vector
       (Rusinkiewicz 1998). ``half-isotropic``: the same without the half vector's azimuth.
+    - ``half-light``: the same half vector, and ω_i: what bent normals do to highlights and to diffuse light is then one
+      product each of a direction's feature and the neural texture's.
 
     ``symmetry`` folds the difference vector: ``reciprocal`` takes (dx, dy) and (−dx, −dy) for one, ``bilateral`` also
     (dx, −dy).
@@ -46,6 +48,8 @@ def to_local_frame(wi: torch.Tensor, wo: torch.Tensor, frame: str, symmetry: str
     else:
         stretch = 1.0 / torch.sqrt(sine.clamp_min(1e-12))
         stretched = torch.stack([half[:, 0] * stretch, half[:, 1] * stretch, up], 1)
+    if frame == "half-light":
+        return stretched, wi
     return stretched, torch.stack([dx, dy, dz], 1)
 
 

@@ -27,8 +27,8 @@ class NeuBRDFConfig:
     """Corner weights: ``"bilinear"`` and ``"idw"`` in training and at run time; ``"uniform"`` = the paper: inverse
     distance in training and 1/4 at run time."""
     frame: str = "absolute"
-    """What the grids are asked for: ``"absolute"`` (paper: ω_i and ω_o), ``"isotropic"``, ``"half"`` or
-    ``"half-isotropic"``; see :func:`warp_neumat.models.local_frame.to_local_frame`."""
+    """What the grids are asked for: ``"absolute"`` (paper: ω_i and ω_o), ``"isotropic"``, ``"half"``,
+    ``"half-isotropic"`` or ``"half-light"``; see :func:`warp_neumat.models.local_frame.to_local_frame`."""
     symmetry: str = "none"
     """What the half frames take for one: ``"none"``, ``"reciprocal"`` or ``"bilateral"``."""
     output: str = "expm1"
@@ -61,7 +61,7 @@ class NeuBRDFConfig:
         ):
             if getattr(self, name) not in allowed:
                 raise ValueError(f"{name} must be one of {', '.join(allowed)}, got {getattr(self, name)!r}")
-        if self.symmetry != "none" and not self.frame.startswith("half"):
+        if self.symmetry != "none" and self.frame not in ("half", "half-isotropic"):
             raise ValueError(f"symmetry {self.symmetry!r} needs frame half or half-isotropic, got frame {self.frame!r}")
         if self.symmetry == "bilateral" and self.frame != "half-isotropic":
             raise ValueError("symmetry 'bilateral' needs frame half-isotropic; use reciprocal")
@@ -106,7 +106,7 @@ def configure(source, options: dict) -> NeuBRDFConfig:
     isotropic = bool(source.isotropic)
     frame = options.get("frame", "half-isotropic" if isotropic else "half")
     defaults: dict = {"frame": frame}
-    if frame.startswith("half"):
+    if frame in ("half", "half-isotropic"):
         symmetry = getattr(source, "symmetry", "none")
         if symmetry == "bilateral" and frame != "half-isotropic" or reciprocal and symmetry == "none":
             symmetry = "reciprocal"

@@ -22,6 +22,7 @@ def to_local_frame(wi: np.ndarray, wo: np.ndarray, frame: str, symmetry: str = "
       y² < 1e-12) nothing is turned.
     - ``"half"`` returns half and difference vector (Rusinkiewicz 1998: d = ω_i turned by −φ_h about z, then by −θ_h
       about y), the half vector's sin θ replaced by its root; ``"half-isotropic"`` also sets its azimuth to 0.
+    - ``"half-light"`` returns the same half vector, and ω_i.
 
     Args:
         wi, wo: Unit directions with z ≥ 0, (N, 3).
@@ -32,6 +33,8 @@ def to_local_frame(wi: np.ndarray, wo: np.ndarray, frame: str, symmetry: str = "
     wi, wo = np.array(wi, np.float64), np.array(wo, np.float64)
     if frame == "absolute":
         return wi, wo
+    if frame == "half-light":
+        return _half_frame(wi, wo, False, "none")[0], wi
     if frame in ("half", "half-isotropic"):
         return _half_frame(wi, wo, frame == "half-isotropic", symmetry)
     square = wo[:, 0] ** 2 + wo[:, 1] ** 2

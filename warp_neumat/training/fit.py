@@ -28,6 +28,7 @@ from warp_neumat.training.block_loop import BlockTrainer
 from warp_neumat.training.evaluate import brdf_metrics
 from warp_neumat.training.evaluate_maps import sample_grid
 from warp_neumat.training.loop import Plan, Trainer
+from warp_neumat.training.threads import all_threads
 
 PRESETS = {"quick": 0.3, "standard": 1.0, "fine": 4.0}
 """Length of a fit in multiples of the model's default number of steps."""
@@ -215,8 +216,8 @@ def fit(
     Args:
         source: As for :func:`warp_neumat.io.brdf.open_brdf`, or for model ``bcf`` as for
             :func:`warp_neumat.io.texture_set.open_texture_set`.
-        out: The ``.neumat`` file to write; replaced if it exists. Its folder must exist. A config that is for comparison
-            alone (``storage``, ``pixelation``) is fitted and measured, and nothing is written.
+        out: The ``.neumat`` file to write; replaced if it exists. Its folder must exist. What is for comparison alone
+            (``storage``, ``pixelation``) is fitted and measured, and nothing is written.
         model: Name in :data:`warp_neumat.models.REGISTRY`; default: :func:`default_model`.
         steps: Optimiser steps; default: the model's, times the preset's factor.
         seed: Same seed, same file (on one machine with the same number of threads).
@@ -253,9 +254,7 @@ def fit(
     check_writable(out)  # now, not after minutes of training
     if announce and (text := kind.described(opened, shape)):
         announce(text)
-    threads = torch.get_num_threads()
-    torch.set_num_threads(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
-    try:
+    with all_threads():
         settled = kind.opening(opened, opening)
         identity = {"source": _named(source), "opening": settled, "model": model, "config": repr(shape)}
         more = {"checkpoint": checkpoint_path(out), "identity": identity, "progress": progress}
@@ -276,8 +275,6 @@ def fit(
         if tensors:  # what is fitted for comparison alone has no file
             write_asset(out, tensors, header)
         header["training"]["seconds"] = seconds
-    finally:
-        torch.set_num_threads(threads)
     checkpoint_path(out).unlink(missing_ok=True)
     if progress:
         progress(1.0, f"wrote {out}" if tensors else "measured; for comparison alone, so nothing is written")
