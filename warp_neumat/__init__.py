@@ -26,9 +26,12 @@ _HOMES = {
     "corners": "kernels.healpix",
     "export_bcf": "export.bcf",
     "fit": "training.fit",
+    "fit_shared": "training.sharing",
     "half_vectors": "kernels.frame",
     "load": "materials.base",
     "mlp_eval": "kernels.mlp",
+    "open_brdf": "io.brdf",
+    "open_brdfs": "io.brdf_set",
     "open_texture_set": "io.texture_set",
     "read_dds": "io.dds",
     "read_ktx2": "io.ktx2",
@@ -38,6 +41,7 @@ _HOMES = {
     "vec2pix": "kernels.healpix",
     "write_dds": "io.dds",
     "write_ktx2": "io.ktx2",
+    "write_merl": "io.merl",
 }
 
 __all__ = sorted(_HOMES)

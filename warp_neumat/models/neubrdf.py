@@ -296,6 +296,11 @@ class NeuBRDF(nn.Module):
         own = self.codebook if self.quantised else self.table
         return [own, self.net, *([] if self.texture is None else [self.texture.texels])]
 
+    @property
+    def step_threads(self) -> int | None:
+        """Threads of torch that a step deserves: 1 beside the fused kernel where its arrays are small, None for all."""
+        return 1 if self.table.device.type == "cpu" and self.table.numel() < 1 << 18 else None
+
     def rates(self, parameters) -> list[float]:
         """Return the factors of the learning rate: texels are seen by few samples each, and take longer steps."""
         return [1.0, 1.0, 3.0][: len(parameters)]

@@ -16,6 +16,7 @@ import torch
 
 from warp_neumat.kernels import dispatch
 from warp_neumat.training import checkpoint
+from warp_neumat.training.threads import torch_threads
 
 CHUNK = 32
 """Batches that are drawn at once, and gone through :data:`PASSES` times before the next are drawn."""
@@ -145,9 +146,10 @@ class Trainer:
             high, low = stage["lr"]
             for group, rate in zip(optimiser.param_groups, rates, strict=True):
                 group["lr"] = rate * (low + (high - low) * 0.5 * (1.0 + math.cos(math.pi * position)))
-            optimiser.zero_grad(set_to_none=True)
-            loss = self.model.gradients(batch, self.loss)
-            optimiser.step()
+            with torch_threads(self.model.step_threads):
+                optimiser.zero_grad(set_to_none=True)
+                loss = self.model.gradients(batch, self.loss)
+                optimiser.step()
             self._step += 1
             if within == CHUNK - 1:
                 self._note(stage, loss)

@@ -1,4 +1,4 @@
-"""How many threads torch has while a fit runs."""
+"""How many threads torch uses: all cores in a fit, one where its arrays are too small to share."""
 
 from __future__ import annotations
 
@@ -9,11 +9,19 @@ import torch
 
 
 @contextlib.contextmanager
-def all_threads():
-    """Give torch every core that this process may use for the length of a ``with`` block, and what it had after it."""
+def torch_threads(count: int | None):
+    """Give torch ``count`` threads inside, and what it had afterwards; None changes nothing."""
     before = torch.get_num_threads()
-    torch.set_num_threads(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
+    if count is None or count == before:
+        yield
+        return
+    torch.set_num_threads(count)
     try:
         yield
     finally:
         torch.set_num_threads(before)
+
+
+def all_threads():
+    """Give torch every core that this process may use inside, and what it had afterwards."""
+    return torch_threads(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
