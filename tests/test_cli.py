@@ -77,7 +77,7 @@ def test_debug_shows_the_traceback_wherever_it_stands(run, scene):
 def test_info_shows_the_asset(run, scene):
     code, stdout, _ = run("info", scene / "noise.neumat")
     assert code == 0
-    assert "neubrdf version 1" in stdout
+    assert "neubrdf version 2" in stdout
     assert "config.nside: 2" in stdout
     code, stdout, _ = run("info", scene / "noise.neumat", "--json", "-")
     assert json.loads(stdout)["tensors"]["codebook"]["shape"] == [8, 8]

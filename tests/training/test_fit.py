@@ -149,3 +149,21 @@ def test_wrong_arguments_are_explained_before_training(tmp_path, monkeypatch, ar
     with pytest.raises(error, match=message):
         fit(SOURCE, out, **arguments)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_fit_that_creates_energy_trains_on(tmp_path, monkeypatch):
+    monkeypatch.setattr(fitting, "MOST_EXCESS", 1e9)
+    kept = fit(SOURCE, tmp_path / "kept.neumat", steps=64, **TINY)
+    assert "energy_rounds" not in kept["metrics"]
+    monkeypatch.setattr(fitting, "MOST_EXCESS", 0.0)  # as if any light were too much
+    monkeypatch.setattr(fitting, "ENERGY_ROUNDS", 2)
+    headers = [fit(SOURCE, tmp_path / f"{name}.neumat", steps=64, **TINY) for name in "ab"]
+    assert headers[0]["metrics"]["energy_rounds"] == 2
+    kept, first, second = (read_asset(tmp_path / f"{name}.neumat")[0] for name in ("kept", "a", "b"))
+    assert not np.array_equal(kept["codebook"], first["codebook"])
+    assert all(np.array_equal(first[name], second[name]) for name in first)
+
+
+@pytest.mark.parametrize("suffix", ["binary", "bsdf", "csv", "csv?isotropic=1", "npz"])
+def test_measured_files_are_for_neubrdf(suffix):
+    assert default_model(f"measured.{suffix}") == "neubrdf"

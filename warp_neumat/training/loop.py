@@ -101,6 +101,22 @@ class Trainer:
             "loss": self.last_loss,
         }
 
+    def polish(self, name: str, sampler, steps: int) -> None:
+        """Train on for ``steps`` with everything rounded as it is stored, on what ``sampler`` draws.
+
+        After :meth:`run`. It is short, so it leaves no checkpoints: a fit killed in it resumes before it.
+        """
+        stage = {"name": name, "kind": "round", "share": steps / self.plan.steps, "lr": (1e-3, 1e-5), "events": 0}
+        kept = self.sampler, self.checkpoint, self.plan
+        self.sampler, self.checkpoint = sampler, None
+        self.plan = dataclasses.replace(self.plan, budget_seconds=None)
+        self.stages, self._step, self._event = [*self.stages, stage], 0, 0
+        try:
+            self._run_stage(stage)
+        finally:
+            self.sampler, self.checkpoint, self.plan = kept
+            self._stage += 1
+
     def _tick(self) -> None:
         now = time.monotonic()
         for key in self._elapsed:
@@ -118,7 +134,7 @@ class Trainer:
 
     def _report(self, stage: dict, text: str) -> None:
         before = sum(s["share"] for s in self.stages[: self._stage])
-        self.progress(min(1.0, before + stage["share"] * min(1.0, self._position(stage))), text)
+        self.progress(min(0.999, before + stage["share"] * min(1.0, self._position(stage))), text)
 
     def _run_stage(self, stage: dict) -> None:
         name = stage["name"]

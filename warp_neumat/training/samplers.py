@@ -28,6 +28,11 @@ def _projected(count, rng, power=0.5):
     return _polar(u**power, 2 * np.pi * v)
 
 
+def _towards_horizon(count, rng, power):
+    """Directions with z = u^1.5 and, every second one, z = u^power: the last degree counts in a white furnace."""
+    return _projected(count, rng, np.where(np.arange(count) % 2, power, 1.5))
+
+
 def _mirrored(wo, rng):
     """Reflect ω_o about half vectors with θ_h = (π/2)·u²; what falls below the horizon is drawn again."""
     wi = np.empty_like(wo)
@@ -51,16 +56,18 @@ class BRDFSampler:
     Args:
         source: As returned by :func:`warp_neumat.io.brdf.open_brdf`.
         rng: Its draws are all that the samples depend on.
+        mixture: Share of each strategy.
+        horizon: How far half of the grazing samples lean: cos θ_o = u^horizon, u uniform.
     """
 
-    def __init__(self, source, rng: np.random.Generator):
-        self.source, self.rng = source, rng
+    def __init__(self, source, rng: np.random.Generator, mixture: dict[str, float] = MIXTURE, horizon: float = 3.0):
+        self.source, self.rng, self.mixture, self.horizon = source, rng, mixture, horizon
 
     def directions(self, count: int) -> tuple[np.ndarray, np.ndarray]:
         """Return unit ω_i and ω_o, (count, 3) float32 each, from the mixture, in random order."""
         rng = self.rng
-        peak, grazing = (int(MIXTURE[k] * count) for k in ("peak", "grazing"))
-        wo = np.concatenate([_projected(count - grazing, rng), _projected(grazing, rng, 1.5)])
+        peak, grazing = (int(self.mixture[k] * count) for k in ("peak", "grazing"))
+        wo = np.concatenate([_projected(count - grazing, rng), _towards_horizon(grazing, rng, self.horizon)])
         wi = np.empty_like(wo)
         cosine = count - grazing - peak
         wi[:cosine] = _projected(cosine, rng)
