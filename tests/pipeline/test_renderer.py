@@ -110,6 +110,35 @@ def test_screen_space_matches_float64(sphere, asset, material):
     assert frame.stats["texels"]["shaded"] == covered.sum()
 
 
+def test_a_neural_texture_is_shaded_where_it_lies(sphere):
+    tensors, header = random_neubrdf(np.random.default_rng(5), nside=2, bits=3, texture=(4, 3, 3, 1))
+    tensors["codebook"] = (0.25 * tensors["codebook"].astype(np.float32)).astype(np.float16)
+    renderer = _renderer(sphere, NeuBRDF(tensors, header), space="screen")
+    frame = renderer.frame(0)
+    triangle = renderer.raster.triangle.numpy()
+    covered = triangle >= 0
+    b1, b2 = renderer.raster.barycentric.numpy().astype(np.float64)[covered].T
+    weights, mesh, corners = np.stack([1 - b1 - b2, b1, b2], axis=1), sphere.frame(0), sphere.faces[triangle[covered]]
+    uv = (sphere.uv[corners] * weights[..., None]).sum(1)
+
+    def shaded(uv):
+        return reference.shade(
+            mesh.points[corners],
+            mesh.normals[corners],
+            mesh.tangents[corners],
+            weights,
+            renderer.camera.at(0).eye,
+            *LIGHTS.at(0),
+            lambda wi, wo, lit: reference_eval(tensors, header["config"], wi, wo, uv=uv[lit]) * wi[:, 2:],
+            projected=True,
+        )
+
+    expected = shaded(uv)
+    close = np.abs(frame.image[covered] - expected) <= 2e-3 * expected + 2e-3
+    assert close.mean() > 0.999
+    assert (np.abs(shaded(1 - uv) - expected) > 0.02).mean() > 0.3  # it does vary over the surface
+
+
 def test_texture_space_without_reuse_is_close_to_screen_space(sphere, material, atlas):
     ours = _renderer(sphere, material, atlas=atlas, interval=0).frame(0).image.copy()
     screen = _renderer(sphere, material, space="screen").frame(0).image
