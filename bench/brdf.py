@@ -211,6 +211,9 @@ def main(arguments: list[str] | None = None) -> int:
     quick, file, device = chosen.pop("quick"), chosen.pop("json"), chosen.pop("device")
     if quick:  # only what was asked for replaces the quick choice
         chosen = {name: value for name, value in chosen.items() if value != defaults[name]}
+    import warp
+
+    warp.config.log_level = warp.LOG_WARNING
     try:
         for path in (file, chosen.get("picture"), chosen.get("cache")):
             if path is not None:

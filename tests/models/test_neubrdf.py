@@ -391,3 +391,13 @@ def test_uniform_weights_are_evaluated_as_they_run(rng):
     got = neubrdf.from_asset(tensors, header["config"]).evaluate(wi, wo)
     close = np.abs(got - expected) / (1 + expected) < 1e-4
     assert close.all(1).mean() > 0.97  # weights of 1/4 jump at pixel edges, where rounding decides
+
+
+@pytest.mark.parametrize(("count", "nside"), [(100, 2), (576, 4), (2000, 8), (10000, 16)])
+def test_the_grid_of_sparse_samples_follows_their_number(count, nside):
+    class Listed:
+        isotropic, symmetry, name = True, "reciprocal", "listed"
+        samples = (np.zeros((count, 3), np.float32),) * 3
+
+    assert neubrdf.configure(Listed(), {}).nside == nside
+    assert neubrdf.configure(Listed(), {"nside": 32}).nside == 32

@@ -123,9 +123,12 @@ def configure(source, options: dict) -> NeuBRDFConfig:
 
 
 def _sparse_nside(samples: int) -> int:
-    """Return the resolution whose points are about as many as the samples, a power of two in [2, 16]."""
-    wanted = (samples / 6) ** 0.5
-    return next((nside for nside in (16, 8, 4) if wanted >= nside), 2)
+    """Return the resolution with at least four samples a point, a power of two in [2, 16].
+
+    576 samples of alum-bronze: sphere MAE 0.0027 with 4, 0.0062 with 8, 0.0070 with 16; of red-plastic 0.0027, 0.0040,
+    0.0051.
+    """
+    return next((nside for nside in (16, 8, 4) if samples >= 24 * nside * nside), 2)
 
 
 ISOTROPIC = {"nside": 16, "bits": 11}
