@@ -74,7 +74,12 @@ class NeuBRDF(nn.Module):
             self.texture = NeuralTexture(*config.texture, generator=generator)
             groups += ((config.texture[2], NeuralTexture.TAPS),)
         self.shape = StepShape(groups, config.hidden)
-        self._levels = levels(config.nside) if config.pixelation == "healpix" else [config.nside]
+        self._lattice = None  # HEALPix
+        if config.pixelation != "healpix":
+            from warp_neumat.kernels.pixelations import PIXELATIONS  # for comparison alone
+
+            self._lattice = PIXELATIONS[config.pixelation]
+        self._levels = levels(config.nside) if self._lattice is None else [config.nside]
         self.register_buffer("level", torch.tensor(0))
         self.points = self._points(config.nside)
         # Features start as smooth functions of the direction (the direction itself first), so that the decoder sees
@@ -94,21 +99,12 @@ class NeuBRDF(nn.Module):
         self._step = None
 
     def _points(self, nside: int) -> int:
-        if self.config.pixelation == "healpix":
-            return hemisphere_point_count(nside)
-        from warp_neumat.kernels.pixelations import PIXELATIONS
-
-        return PIXELATIONS[self.config.pixelation].points(nside)
-
-    def _positions(self) -> torch.Tensor:
-        if self.config.pixelation == "healpix":
-            return torch.tensor(directions(self.nside), dtype=torch.float32)
-        from warp_neumat.kernels.pixelations import PIXELATIONS
-
-        return torch.tensor(PIXELATIONS[self.config.pixelation].positions(self.nside), dtype=torch.float32)
+        return hemisphere_point_count(nside) if self._lattice is None else self._lattice.points(nside)
 
     def _fill(self, slope, phase) -> None:
-        position = self._positions()
+        nside = self.nside
+        position = directions(nside) if self._lattice is None else self._lattice.positions(nside)
+        position = torch.tensor(position, dtype=torch.float32)
         smooth = torch.sin(position @ slope + phase)
         smooth[:, :3] = position
         with torch.no_grad():
@@ -153,12 +149,10 @@ class NeuBRDF(nn.Module):
         corners, weights = [], []
         base = samples["material"].view(-1, 1).int() * (2 * points) if "material" in samples else 0
         for side, direction in enumerate(to_local_frame(samples["wi"], samples["wo"], config.frame, config.symmetry)):
-            if config.pixelation == "healpix":
+            if self._lattice is None:
                 corner, weight = corner_weights(self.nside, direction, interpolation or config.training_interpolation)
             else:
-                from warp_neumat.kernels.pixelations import PIXELATIONS
-
-                corner, weight = PIXELATIONS[config.pixelation].corners(self.nside, direction.contiguous())
+                corner, weight = self._lattice.corners(self.nside, direction.contiguous())
             corners.append(corner + (base + side * points))
             weights.append(weight)
         if self.texture is not None:
@@ -349,7 +343,7 @@ class NeuBRDF(nn.Module):
 
     def _inherit(self) -> None:
         """Give the points that are not stored the indices that a file gives them: their ancestors'."""
-        if self.config.pixelation != "healpix":
+        if self._lattice is not None:
             return
         for material in range(self.count):
             own = self._own(material)
