@@ -8,7 +8,6 @@ import json
 import os
 import tempfile
 import time
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -90,8 +89,9 @@ class Lab:
         chosen = self.choice.materials or MATERIALS[self.choice.set]
         if chosen != ("all",):
             return chosen
-        with zipfile.ZipFile(_file(self.choice.set)) as archive:
-            return tuple(sorted({entry.split("/")[0] for entry in archive.namelist() if "/" in entry}))
+        from warp_neumat.io.brdf import function_names
+
+        return tuple(function_names(_file(self.choice.set)))
 
     def specification(self, material: str) -> str:
         """Return what ``open_brdf`` takes."""

@@ -15,7 +15,7 @@ import numpy as np
 
 from .brdf_source import CHUNK, BRDFSource, half_difference, in_chunks, rusinkiewicz, suggest
 
-__all__ = ["FORMS", "BRDFSource", "NetworkBRDF", "open_brdf", "rusinkiewicz"]
+__all__ = ["FORMS", "BRDFSource", "NetworkBRDF", "function_names", "open_brdf", "rusinkiewicz"]
 
 FORMS = {
     "FILE.npz:NAME": "a function fitted to measurements",
@@ -167,25 +167,34 @@ class NetworkBRDF:
         return y.transpose(0, 2, 1).reshape(-1, 3)[:count]
 
 
-def _names(path: Path) -> list[str]:
-    with zipfile.ZipFile(path) as archive:
-        return sorted({entry.rsplit("/", 1)[0] for entry in archive.namelist() if "/" in entry})
+def function_names(path: Path) -> list[str]:
+    """Return the names of the functions in an ``.npz``, sorted.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If it is no ``.npz``.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file; give the path of an .npz with BRDF functions")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return sorted({entry.rsplit("/", 1)[0] for entry in archive.namelist() if "/" in entry})
+    except zipfile.BadZipFile as error:
+        raise ValueError(f"{path}: not a readable .npz of BRDF functions ({error}); fetch the file again") from None
 
 
 def _example(path: str) -> str:
     try:
-        return f", as {path}:{_names(Path(path))[0]}"
-    except (OSError, zipfile.BadZipFile, IndexError):
+        return f", as {path}:{function_names(Path(path))[0]}"
+    except (OSError, ValueError, IndexError):
         return ""
 
 
 def _open_npz(path: Path, name: str) -> NetworkBRDF:
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file; give the path of an .npz with BRDF functions")
+    names = function_names(path)
+    if name not in names:
+        raise ValueError(f"{path}: no material {name!r}; {suggest(name, names)}")
     try:
-        names = _names(path)
-        if name not in names:
-            raise ValueError(f"{path}: no material {name!r}; {suggest(name, names)}")
         with np.load(path, allow_pickle=False) as archive:
             weights = {key: archive[f"{name}/{key}"] for key in ("w0", "b0", "w1", "b1", "w2", "b2")}
     except (zipfile.BadZipFile, KeyError, EOFError) as error:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import fnmatch
 import re
-import zipfile
 from pathlib import Path
 from typing import NamedTuple
 
-from warp_neumat.io.brdf import open_brdf
+from warp_neumat.io.brdf import function_names, open_brdf
 from warp_neumat.io.brdf_source import BRDFSource
 
 SUFFIXES = (".binary", ".bsdf", ".csv")
@@ -45,13 +44,7 @@ def open_brdfs(spec: str) -> dict[str, Opened]:
         source = open_brdf(spec)
         return {_file_name(source.name): Opened(spec, source)}
     file, pattern = Path(match["file"]), match["pattern"] or "*"
-    if not file.is_file():
-        raise FileNotFoundError(f"{file}: no such file; give the path of an .npz with BRDF functions")
-    try:
-        with zipfile.ZipFile(file) as archive:
-            names = sorted({entry.rsplit("/", 1)[0] for entry in archive.namelist() if "/" in entry})
-    except zipfile.BadZipFile as error:
-        raise ValueError(f"{file}: not a readable .npz of BRDF functions ({error}); fetch the file again") from None
+    names = function_names(file)
     chosen = fnmatch.filter(names, pattern)
     if not chosen:
         raise ValueError(f"{spec}: no material matches {pattern!r}; there are {', '.join(names[:8])}, …")

@@ -15,7 +15,7 @@ import warp as wp
 
 from warp_neumat.kernels.approx import exp2
 from warp_neumat.kernels.dispatch import module_options
-from warp_neumat.kernels.healpix_chart import _quarters as quarters
+from warp_neumat.kernels.healpix_chart import quarters
 
 wp.set_module_options(module_options())
 

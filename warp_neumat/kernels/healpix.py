@@ -146,7 +146,7 @@ def _settled_nest(nside: int, d: wp.vec3d) -> int:
 
 
 @wp.func
-def _corner(nside: int, k: int, i: int, j: int, north: bool):
+def corner_number(nside: int, k: int, i: int, j: int, north: bool):
     """Return the index of the grid corner at whole pyramid coordinates (i, j) of quarter k."""
     ring = i + j
     c = wp.min(ring, nside)
@@ -171,10 +171,10 @@ def corners_of(nside: int, d: wp.vec3):
     v = wp.clamp(b - float(j), 0.0, 1.0)
     north = d[2] >= 0.0
     index = wp.vec4i(
-        _corner(nside, k, i, j, north),
-        _corner(nside, k, i + 1, j, north),
-        _corner(nside, k, i, j + 1, north),
-        _corner(nside, k, i + 1, j + 1, north),
+        corner_number(nside, k, i, j, north),
+        corner_number(nside, k, i + 1, j, north),
+        corner_number(nside, k, i, j + 1, north),
+        corner_number(nside, k, i + 1, j + 1, north),
     )
     return index, wp.vec4((1.0 - u) * (1.0 - v), u * (1.0 - v), (1.0 - u) * v, u * v)
 

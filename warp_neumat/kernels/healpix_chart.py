@@ -49,7 +49,7 @@ _NEAR = wp.constant(wp.float64(4e-14))
 
 
 @wp.func
-def _quarters(t: wp.float32):
+def quarters(t: wp.float32):
     """Return atan(t) in quarter turns, t in [0, 1]."""
     u = t * t
     p = _ATAN32[8]
@@ -59,7 +59,7 @@ def _quarters(t: wp.float32):
 
 
 @wp.func
-def _quarters(t: wp.float64):  # noqa: F811  (an overload)
+def quarters(t: wp.float64):  # noqa: F811  (an overload)
     u = t * t
     v = u * u
     even = _ATAN64[16]  # two chains, so that neither waits for the other's multiply-adds
@@ -105,7 +105,7 @@ def chart(nside: int, d: Any):
     # Longitude: atan of the smaller over the larger component, folded out to the quarter turn that the signs name.
     steep = ay > ax
     larger = wp.max(ax, ay)
-    t = _quarters(wp.min(ax, ay) / wp.where(larger > zero, larger, one))
+    t = quarters(wp.min(ax, ay) / wp.where(larger > zero, larger, one))
     west = d[0] < zero
     south = d[1] < zero
     odd = west != south

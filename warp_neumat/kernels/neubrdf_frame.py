@@ -19,7 +19,7 @@ import functools
 import warp as wp
 
 from warp_neumat.kernels.dispatch import module_options
-from warp_neumat.kernels.healpix import _corner, corners_of
+from warp_neumat.kernels.healpix import corner_number, corners_of
 from warp_neumat.kernels.healpix_chart import chart, square
 
 wp.set_module_options(module_options())
@@ -163,10 +163,10 @@ def corners_by_distance(nside: int, d: wp.vec3):
     w3 = 1.0 / wp.max(_distance(nside, i + 1, j + 1, t, z, sine), _NEAREST)
     total = 1.0 / (w0 + w1 + w2 + w3)
     index = wp.vec4i(
-        _corner(nside, k, i, j, True),
-        _corner(nside, k, i + 1, j, True),
-        _corner(nside, k, i, j + 1, True),
-        _corner(nside, k, i + 1, j + 1, True),
+        corner_number(nside, k, i, j, True),
+        corner_number(nside, k, i + 1, j, True),
+        corner_number(nside, k, i, j + 1, True),
+        corner_number(nside, k, i + 1, j + 1, True),
     )
     return index, wp.vec4(w0 * total, w1 * total, w2 * total, w3 * total)
 

@@ -41,7 +41,7 @@ from warp_neumat.kernels.fibonacci import (
     turn_of,
     upper,
 )
-from warp_neumat.kernels.healpix_chart import _quarters as quarters
+from warp_neumat.kernels.healpix_chart import quarters
 
 wp.set_module_options(module_options())
 

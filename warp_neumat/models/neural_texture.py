@@ -6,6 +6,8 @@ import numpy as np
 import torch
 from torch import nn
 
+from warp_neumat.io.mipmaps import mip_sizes
+
 
 class NeuralTexture(nn.Module):
     """Features by texture coordinate and level of detail; repeats beyond [0, 1).
@@ -67,11 +69,3 @@ class NeuralTexture(nn.Module):
         """Take the features out of stored mips."""
         flat = np.concatenate([mip.reshape(-1, mip.shape[2]) for mip in mips])
         self.texels.copy_(torch.from_numpy(flat.astype(np.float32)))
-
-
-def mip_sizes(width: int, height: int) -> list[tuple[int, int]]:
-    """Return (width, height) of every mip down to 1×1."""
-    sizes = [(width, height)]
-    while sizes[-1] != (1, 1):
-        sizes.append((max(1, sizes[-1][0] // 2), max(1, sizes[-1][1] // 2)))
-    return sizes
