@@ -146,3 +146,55 @@ def fake_bcf(path, *, seed=0, **shape) -> dict:
     tensors, header = random_bcf(np.random.default_rng(seed), **shape)
     write_asset(path, tensors, header)
     return header
+
+
+def random_btf(
+    rng,
+    *,
+    width=32,
+    height=24,
+    mips=3,
+    fine=16,
+    hidden=(8, 8, 8),
+    coarse=(14, (8, 8, 8), 8),
+    half_vector=True,
+    features="half",
+):
+    """Return (tensors, header) of a neural BTF whose values are mostly positive and vary with everything.
+
+    Args:
+        rng: Generator.
+        width, height, mips, half_vector, features: As in the config.
+        fine, hidden: Channels and hidden widths of the fine network.
+        coarse: (channels, hidden widths, latent) of the coarse network; None = a single level.
+    """
+    config = {
+        "width": width, "height": height, "mips": mips, "half_vector": half_vector, "features": features,
+        "fine": {"channels": fine, "hidden": list(hidden)}, "coarse": None,
+    }  # fmt: skip
+    entering = 9 if half_vector else 6
+    plans = {"fine": (fine, (entering + fine, *hidden, 3))}
+    if coarse:
+        channels, inner, latent = coarse
+        config["coarse"] = {"channels": channels, "hidden": list(inner), "latent": latent}
+        plans = {
+            "fine": (fine, (latent + fine, *hidden, 3)),
+            "coarse": (channels, (entering + channels, *inner, latent)),
+        }
+    tensors = {}
+    for name, (channels, widths) in plans.items():
+        for n, (i, o) in enumerate(zip(widths[:-1], widths[1:], strict=True)):
+            tensors[f"{name}.weight{n}"] = (rng.normal(size=(o, i)) * np.sqrt(2.2 / i)).astype(np.float16)
+            tensors[f"{name}.bias{n}"] = np.full(o, 0.6 if o == 3 else 0.2, np.float16)
+        for m in range(mips):
+            w, h = max(1, width >> m), max(1, height >> m)
+            if name == "coarse":
+                w, h = max(1, w // 2), max(1, h // 2)
+            if features == "half":
+                tensors[f"{name}.mip{m}"] = rng.normal(size=(h, w, channels)).astype(np.float16)
+                continue
+            rows, columns = -(-h // 4), -(-w // 4)
+            for t in range(-(-channels // 3)):
+                blocks = random_blocks(rng, rows * columns, signed=True, modes=(10,))
+                tensors[f"{name}.block{t}.mip{m}"] = blocks.reshape(rows, columns, 16)
+    return tensors, {"kind": "btf", "version": 1, "config": config}

@@ -17,7 +17,7 @@ from safetensors.numpy import save
 
 from warp_neumat.io.atomic import replacing
 
-KINDS = {"bcf": 1, "neubrdf": 2, "neubrdf-group": 1}
+KINDS = {"bcf": 1, "btf": 1, "neubrdf": 2, "neubrdf-group": 1}
 """Known kinds and the newest version of each that this release reads."""
 
 _KEY = "neumat"

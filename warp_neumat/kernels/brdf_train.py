@@ -22,14 +22,10 @@ import warp as wp
 
 from warp_neumat.kernels import dispatch
 from warp_neumat.kernels.neubrdf import LOG_LIMIT
+from warp_neumat.kernels.row_products import VECTORS, padded, product
 
 PATCH = 64
 """Samples that go through the network at once: their activations (80 kB at 32→64→64→3) stay in second-level cache."""
-
-
-def padded(width: int) -> int:
-    """Return ``width`` rounded up to whole registers of 8 float32."""
-    return -(-width // 8) * 8
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,15 +83,10 @@ class StepShape:
 
 
 _HEAD = """
-typedef float V __attribute__((vector_size(32), aligned(4), may_alias));
-typedef int I8 __attribute__((vector_size(32), aligned(4), may_alias));
 enum { L = %(L)d };
-const V Z = {};
 const float* const net = weights.data;
 float* const gw = weight_gradient.data + (long long)part * %(NW)d;
 float* const gt = table_gradient.data + (long long)part * table_size;
-auto sum8 = [](V s) { return ((s[0] + s[4]) + (s[1] + s[5])) + ((s[2] + s[6]) + (s[3] + s[7])); };
-auto select = [](I8 m, V a, V b) { return (V)(((I8)a & m) | ((I8)b & ~m)); };
 auto root = [](V x) { V y; for (int i = 0; i < 8; ++i) y[i] = __builtin_sqrtf(x[i]); return y; };
 // e^x for x in [-80, 17]: 2^n times the minimax polynomial of kernels/approx.py.
 auto exponential = [](V x) {
@@ -119,54 +110,10 @@ auto log1p = [](V x) {
 """
 
 
-def _product(
-    *, a, row, step, rows, depth, b, stride, columns, out, width, start="Z", mask=None, relu=False, add=False
-) -> str:
-    """C++ of out[r][o] = start + Σ_k a[r·row + k·step] · b[k·stride + o], 4 rows and 16 columns at a time.
-
-    ``start`` is the name of a row to start from, ``mask`` of a matrix like ``out``: 0 is written where it is not
-    above 0.
-    """
-
-    def tile(vectors: int, begin: str, end: str, tall: int, first: str, last: str) -> str:
-        cells = [(r, u) for r in range(tall) for u in range(vectors)]
-        text = [f"for (int r = {first}; r < {last}; r += {tall})"]
-        text.append(f"for (int o = {begin}; o < {end}; o += {8 * vectors}) {{")
-        for r, u in cells:
-            value = "Z" if start == "Z" else f"*(const V*)({start} + o + {8 * u})"
-            text.append(f"V s{r}_{u} = {value};")
-        text.append(f"const float* p = {a} + r * {row}; const float* q = {b} + o;")
-        text.append('_Pragma("clang loop unroll_count(4)")')
-        text.append(f"for (int k = 0; k < {depth}; ++k, p += {step}, q += {stride}) {{")
-        text += [f"const V q{u} = *(const V*)(q + {8 * u});" for u in range(vectors)]
-        for r in range(tall):
-            sums = "".join(f" s{r}_{u} += q{u} * x;" for u in range(vectors))
-            text.append(f"{{ const float x = p[{r} * {row}];{sums} }}")
-        text.append("}")
-        for r, u in cells:
-            place = f"({out} + (r + {r}) * {width} + o + {8 * u})"
-            value = f"s{r}_{u}"
-            if relu:
-                value = f"select({value} > 0.0f, {value}, Z)"
-            if mask:
-                value = f"select(*(const V*)({mask} + (r + {r}) * {width} + o + {8 * u}) > 0.0f, {value}, Z)"
-            text.append(f"*(V*){place} {'+=' if add else '='} {value};")
-        text.append("}")
-        return "\n".join(text)
-
-    # Both sums of rows and columns are multiples of 8, so tiles of 4 by 16 leave at most one column tile of 8.
-    whole = columns // 16 * 16
-    return "\n".join(
-        tile(vectors, str(begin), str(end), 4, "0", str(rows))
-        for vectors, begin, end in ((2, 0, whole), (1, whole, columns))
-        if end > begin
-    )
-
-
 def _cpu_code(shape: StepShape) -> str:
     rows, hidden, last = shape.rows, shape.hidden, shape.hidden[-1]
     depth = len(hidden)
-    text = [_HEAD % {"L": PATCH, "NW": shape.weights}]
+    text = [VECTORS, _HEAD % {"L": PATCH, "NW": shape.weights}]
     text.append(f"float* at = scratch.data + (long long)part * {shape.scratch};")
     text.append("at += (16 - ((unsigned long long)at / 4) % 16) % 16;")
     for n, width in enumerate(rows):
@@ -202,7 +149,7 @@ def _cpu_code(shape: StepShape) -> str:
     for n in range(depth):
         bias, weights = shape.offsets[n]
         text.append(
-            _product(
+            product(
                 a=f"A{n}", row=rows[n], step=1, rows="L", depth=rows[n], b=f"(net + {weights})", stride=hidden[n],
                 columns=hidden[n], out=f"A{n + 1}", width=hidden[n], start=f"(net + {bias})", relu=True,
             )
@@ -260,13 +207,13 @@ def _cpu_code(shape: StepShape) -> str:
         text.append(f"for (int o = 0; o < {hidden[n]}; o += 8) {{ V s = Z; for (int l = 0; l < L; ++l)"
                     f" s += *(const V*)(D{n + 1} + l * {hidden[n]} + o); *(V*)(gw + {bias} + o) += s; }}")  # fmt: skip
         text.append(
-            _product(
+            product(
                 a=f"A{n}", row=1, step=rows[n], rows=rows[n], depth="L", b=f"D{n + 1}", stride=hidden[n],
                 columns=hidden[n], out=f"(gw + {weights})", width=hidden[n], add=True,
             )
         )  # fmt: skip
         text.append(
-            _product(
+            product(
                 a=f"D{n + 1}", row=hidden[n], step=1, rows="L", depth=hidden[n], b=f"T{n}", stride=rows[n],
                 columns=rows[n], out=f"D{n}", width=rows[n], mask=f"A{n}" if n else None,
             )

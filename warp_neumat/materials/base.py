@@ -12,7 +12,11 @@ import numpy as np
 from warp_neumat.io.shared_asset import read_whole_asset
 from warp_neumat.materials import brdf_sampling
 
-KINDS = {"bcf": "warp_neumat.materials.bcf:BCf", "neubrdf": "warp_neumat.materials.neubrdf:NeuBRDF"}
+KINDS = {
+    "bcf": "warp_neumat.materials.bcf:BCf",
+    "btf": "warp_neumat.materials.btf:BTF",
+    "neubrdf": "warp_neumat.materials.neubrdf:NeuBRDF",
+}
 """Where the class of each kind lives: a kind that a scene does not use is never imported, so never compiled."""
 
 

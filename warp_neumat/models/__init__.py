@@ -15,7 +15,7 @@ Models of reflectance functions (``DATA = "brdf"``) are trained by :mod:`warp_ne
 import difflib
 import importlib
 
-REGISTRY = {"neubrdf": "warp_neumat.models.neubrdf", "bcf": "warp_neumat.models.bcf"}
+REGISTRY = {"neubrdf": "warp_neumat.models.neubrdf", "bcf": "warp_neumat.models.bcf", "btf": "warp_neumat.models.btf"}
 """Module of every model, by the name that ``neumat fit --model`` takes and assets carry as ``kind``."""
 
 

@@ -26,6 +26,7 @@ from pathlib import Path
 
 import numpy as np
 
+from warp_neumat.io.cache import cache_folder
 from warp_neumat.kernels.atlas import FOOTPRINT, atlas_folds, atlas_leaks, atlas_raster
 from warp_neumat.pipeline.unwrap import (
     UnwrapError,
@@ -326,8 +327,7 @@ class _Maker:
 def _cache_file(sequence, resolution, padding, uv, cache) -> Path | None:
     if cache is False or cache is None:
         return None
-    default = os.environ.get("NEUMAT_CACHE") or Path.home() / ".cache" / "warp_neumat"
-    folder = Path(default if cache is True else cache)
+    folder = cache_folder() if cache is True else Path(cache)
     request = f"{CACHE_VERSION}|{sequence.digest()}|{resolution}|{padding}|{uv}"
     return folder / f"atlas-{hashlib.sha256(request.encode()).hexdigest()[:32]}.npz"
 

@@ -7,7 +7,6 @@ leave a checkpoint beside the output and go on from there with ``resume=True``.
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import json
 import math
 import os
@@ -23,16 +22,15 @@ from warp_neumat.io.atomic import check_writable
 from warp_neumat.io.brdf import open_brdf
 from warp_neumat.io.texture_set import open_texture_set
 from warp_neumat.materials.bcf import BCf as BCfMaterial
+from warp_neumat.simulation.open_btf import is_btf_spec
 from warp_neumat.training import losses, samplers, spatial
 from warp_neumat.training.block_loop import BlockTrainer
+from warp_neumat.training.btf import BTFData
 from warp_neumat.training.evaluate import brdf_metrics
 from warp_neumat.training.evaluate_maps import sample_grid
 from warp_neumat.training.loop import Plan, Trainer
+from warp_neumat.training.presets import PRESETS, length_of
 from warp_neumat.training.threads import all_threads
-
-PRESETS = {"quick": 0.3, "standard": 1.0, "fine": 4.0}
-"""Length of a fit in multiples of the model's default number of steps."""
-
 
 MOST_EXCESS, ENERGY_ROUNDS = 1.01, 4
 """Largest ratio of the fit's albedo to max(1, the source's own), and how often a fit trains on to keep it."""
@@ -65,7 +63,7 @@ class BRDFData:
             options = spatial.configured(source, options)
         elif options.get("texture") is not None:
             raise ValueError(f"texture is for what varies over a surface, as {svbrdf.PREFIX}FOLDER; leave it out")
-        return _length(preset, PRESETS), Plan.batch, module.configure(source, options)
+        return length_of(preset), Plan.batch, module.configure(source, options)
 
     @staticmethod
     def sampler(source, texture=None):
@@ -149,13 +147,13 @@ class MapData:
         if batch is not None and (isinstance(batch, bool) or not isinstance(batch, int) or batch < 256 or batch % 256):
             raise ValueError(f"batch must be a multiple of 256, got {batch!r}")
         if preset is not None and length is None:
-            _length(preset, {**PRESETS, **module.PRESETS})
+            length_of(preset, {**PRESETS, **module.PRESETS})
         try:
             shape = module.configure(source, options, None if length else preset)
         except TypeError as error:
             given = ", ".join(f"{name}={value!r}" for name, value in options.items())
             raise ValueError(f"an option is of the wrong type: {given} ({error})") from None
-        return _length(length, PRESETS), batch or MapData.batch(shape), shape
+        return length_of(length), batch or MapData.batch(shape), shape
 
     @staticmethod
     def batch(shape) -> int:
@@ -195,11 +193,13 @@ class MapData:
         return tensors, header, {"psnr": _mean_psnr(trainer.mips, material.encoded)}
 
 
-DATA = {"brdf": BRDFData, "maps": MapData}
+DATA = {"brdf": BRDFData, "maps": MapData, "btf": BTFData}
 
 
 def default_model(source) -> str:
-    """Return the model that a source is for: ``neubrdf`` for measured files and ``KIND:…``, else ``bcf``."""
+    """Return the model that a source is for: ``btf``, ``neubrdf`` for reflectance files and ``KIND:…``, or ``bcf``."""
+    if is_btf_spec(source):
+        return "btf"
     if str(source).startswith(svbrdf.PREFIX):
         return "neubrdf"
     if isinstance(source, dict) or str(source).lower().endswith(".json") or os.path.isdir(source):
@@ -310,13 +310,6 @@ def _whole(name: str, value, least: int) -> int:
     if isinstance(value, bool) or not isinstance(value, int) or value < least:
         raise ValueError(f"{name} must be a whole number of at least {least}, got {value!r}")
     return value
-
-
-def _length(preset, known: dict) -> float:
-    if preset is not None and preset not in known:
-        close = difflib.get_close_matches(preset, known, n=1, cutoff=0.0)[0]
-        raise ValueError(f"no preset {preset!r}; nearest: {close}; known: {', '.join(known)}")
-    return known[preset or "standard"] if preset in PRESETS or preset is None else 1.0
 
 
 def _mean_psnr(mips, encoded) -> float:

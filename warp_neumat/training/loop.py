@@ -23,6 +23,8 @@ CHUNK = 32
 
 PASSES = 4
 EVENT_BATCH = 16384
+PLATEAU = 1e-4
+"""Least fall of the test error between two events that is no plateau (MobileVR §4.4)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,6 +65,7 @@ class Trainer:
         self.stages = model.stages()
         self._stage = self._step = self._event = 0
         self._elapsed = {"total": 0.0, "stage": 0.0}
+        self._plateau = {"halved": 0, "least": 1e30}
         self._pending = None  # optimiser state of a checkpoint, until its stage begins
         self.last_loss = math.nan
 
@@ -145,7 +148,8 @@ class Trainer:
         self.model.enter(stage)
         parameters = self.model.trainable(stage)
         groups, rates = [{"params": [p]} for p in parameters], self.model.rates(parameters)
-        optimiser = torch.optim.Adam(groups, lr=stage["lr"][0], betas=(0.9, 0.99), eps=1e-10, fused=True)
+        adam = {"betas": (0.9, 0.99), "eps": 1e-10, **stage.get("adam", {})}
+        optimiser = torch.optim.Adam(groups, lr=stage["lr"][0], **adam, fused=True)
         if self._pending is not None:
             checkpoint.restore_optimiser(optimiser, parameters, self._pending)
             self._pending = None
@@ -159,9 +163,9 @@ class Trainer:
                 chunk = self._shuffled(chunk)
             start = within % CHUNK * self.plan.batch
             batch = {key: value[start : start + self.plan.batch] for key, value in chunk.items()}
-            high, low = stage["lr"]
+            lr = self._learning_rate(stage, position)
             for group, rate in zip(optimiser.param_groups, rates, strict=True):
-                group["lr"] = rate * (low + (high - low) * 0.5 * (1.0 + math.cos(math.pi * position)))
+                group["lr"] = rate * lr
             with torch_threads(self.model.step_threads):
                 optimiser.zero_grad(set_to_none=True)
                 loss = self.model.gradients(batch, self.loss)
@@ -176,6 +180,13 @@ class Trainer:
             self._take_stock(stage)
         self._tick()
 
+    def _learning_rate(self, stage, position: float) -> float:
+        """Return the rate by the stage's schedule: half a cosine, or halved at every event that found a plateau."""
+        high, low = stage["lr"]
+        if stage.get("schedule") == "plateau":
+            return max(low, high * 0.5 ** self._plateau["halved"])
+        return low + (high - low) * 0.5 * (1.0 + math.cos(math.pi * position))
+
     def _note(self, stage, loss) -> None:
         self.last_loss = float(loss)
         if not math.isfinite(self.last_loss):
@@ -186,7 +197,12 @@ class Trainer:
     def _take_stock(self, stage) -> None:
         self._event += 1
         self._report(stage, f"{stage['name']}: taking stock {self._event}/{stage['events']}")
-        self.model.event(stage, lambda: self._event_batches(self._event), self.loss)
+        number = 0 if stage.get("same_events") else self._event
+        error = self.model.event(stage, lambda: self._event_batches(number), self.loss)
+        if stage.get("schedule") == "plateau":  # as torch's ReduceLROnPlateau without patience, absolute threshold
+            if error >= self._plateau["least"] - PLATEAU:
+                self._plateau["halved"] += 1
+            self._plateau["least"] = min(error, self._plateau["least"])
 
     def _shuffled(self, chunk) -> dict[str, torch.Tensor]:
         """Return a chunk in another order: runs of 64 samples are moved as they are, at the speed of memory."""
@@ -198,8 +214,9 @@ class Trainer:
     def _between_chunks(self, stage, position, optimiser, parameters) -> None:
         """Do what may happen only here: an event that is due, a checkpoint that is due."""
         self._tick()
-        # The last quarter of a stage is free of events, to settle.
-        while self._event < stage["events"] and position >= 0.75 * self._event / stage["events"]:
+        # Unless the stage says otherwise, its last quarter is free of events, to settle.
+        until = stage.get("until", 0.75)
+        while self._event < stage["events"] and position >= until * self._event / stage["events"]:
             self._take_stock(stage)
         if self.checkpoint is not None and time.monotonic() - self._last_save >= self.plan.checkpoint_seconds:
             self._tick()
@@ -216,6 +233,7 @@ class Trainer:
         tensors = {f"model.{name}": value for name, value in self.model.state_dict().items()}
         tensors |= checkpoint.optimiser_tensors(optimiser, parameters)
         state = {"stage": self._stage, "step": self._step, "event": self._event, "elapsed": self._elapsed}
+        state["plateau"] = self._plateau
         checkpoint.save(self.checkpoint, tensors, state, self._facts())
 
     def resume(self) -> bool:
@@ -230,6 +248,6 @@ class Trainer:
         model = {name.removeprefix("model."): value for name, value in tensors.items() if name.startswith("model.")}
         self.model.load_state_dict(model)
         self._stage, self._step, self._event = state["stage"], state["step"], state["event"]
-        self._elapsed = state["elapsed"]
+        self._elapsed, self._plateau = state["elapsed"], state["plateau"]
         self._pending = {name: value for name, value in tensors.items() if name.startswith("optimiser.")}
         return True

@@ -1,0 +1,64 @@
+"""C++ for products of matrices whose rows are samples: the layers of a network and their backward, on the CPU.
+
+Rows (one sample's units) lie contiguous, so that layers, transposed products and gradients of weights are all one
+register-blocked matrix product, and gathered rows need no transposing. Widths are multiples of 8 float32, one AVX
+register. For use in ``wp.func_native`` snippets; :data:`VECTORS` comes first in the snippet.
+"""
+
+VECTORS = """
+typedef float V __attribute__((vector_size(32), aligned(4), may_alias));
+typedef int I8 __attribute__((vector_size(32), aligned(4), may_alias));
+const V Z = {};
+auto sum8 = [](V s) { return ((s[0] + s[4]) + (s[1] + s[5])) + ((s[2] + s[6]) + (s[3] + s[7])); };
+auto select = [](I8 m, V a, V b) { return (V)(((I8)a & m) | ((I8)b & ~m)); };
+"""
+"""Types V and I8 of 8 lanes, zero Z, sum8(v), and select(mask, a, b)."""
+
+
+def padded(width: int) -> int:
+    """Return ``width`` rounded up to whole registers of 8 float32."""
+    return -(-width // 8) * 8
+
+
+def product(
+    *, a, row, step, rows, depth, b, stride, columns, out, width, start="Z", mask=None, relu=False, add=False
+) -> str:
+    """C++ of out[r][o] = start + Σ_k a[r·row + k·step] · b[k·stride + o], 4 rows by 16 columns or 8 by 8 at a time.
+
+    ``rows`` and ``columns`` are multiples of 8. ``start`` is the name of a row to start from, ``mask`` of a matrix like
+    ``out``: 0 is written where it is not above 0.
+    """
+
+    def tile(vectors: int, tall: int, begin: int, end: int) -> str:
+        cells = [(r, u) for r in range(tall) for u in range(vectors)]
+        text = [f"for (int r = 0; r < {rows}; r += {tall})"]
+        text.append(f"for (int o = {begin}; o < {end}; o += {8 * vectors}) {{")
+        for r, u in cells:
+            value = "Z" if start == "Z" else f"*(const V*)({start} + o + {8 * u})"
+            text.append(f"V s{r}_{u} = {value};")
+        text.append(f"const float* p = {a} + r * {row}; const float* q = {b} + o;")
+        text.append('_Pragma("clang loop unroll_count(4)")')
+        text.append(f"for (int k = 0; k < {depth}; ++k, p += {step}, q += {stride}) {{")
+        text += [f"const V q{u} = *(const V*)(q + {8 * u});" for u in range(vectors)]
+        for r in range(tall):
+            sums = "".join(f" s{r}_{u} += q{u} * x;" for u in range(vectors))
+            text.append(f"{{ const float x = p[{r} * {row}];{sums} }}")
+        text.append("}")
+        for r, u in cells:
+            place = f"({out} + (r + {r}) * {width} + o + {8 * u})"
+            value = f"s{r}_{u}"
+            if relu:
+                value = f"select({value} > 0.0f, {value}, Z)"
+            if mask:
+                value = f"select(*(const V*)({mask} + (r + {r}) * {width} + o + {8 * u}) > 0.0f, {value}, Z)"
+            text.append(f"*(V*){place} {'+=' if add else '='} {value};")
+        text.append("}")
+        return "\n".join(text)
+
+    # Columns are a multiple of 8: tiles of 4 by 16 leave at most one of 8, which is as tall as keeps 8 sums going.
+    whole = columns // 16 * 16
+    return "\n".join(
+        tile(vectors, tall, begin, end)
+        for vectors, tall, begin, end in ((2, 4, 0, whole), (1, 8, whole, columns))
+        if end > begin
+    )

@@ -1,0 +1,1 @@
+"""Measuring what does not exist: procedural micro-geometry, and the virtual device that photographs it."""
