@@ -158,19 +158,20 @@ def random_btf(
     hidden=(8, 8, 8),
     coarse=(14, (8, 8, 8), 8),
     half_vector=True,
+    activation="hardswish",
     features="half",
 ):
     """Return (tensors, header) of a neural BTF whose values are mostly positive and vary with everything.
 
     Args:
         rng: Generator.
-        width, height, mips, half_vector, features: As in the config.
+        width, height, mips, half_vector, activation, features: As in the config.
         fine, hidden: Channels and hidden widths of the fine network.
         coarse: (channels, hidden widths, latent) of the coarse network; None = a single level.
     """
     config = {
         "width": width, "height": height, "mips": mips, "half_vector": half_vector, "features": features,
-        "fine": {"channels": fine, "hidden": list(hidden)}, "coarse": None,
+        "fine": {"channels": fine, "hidden": list(hidden)}, "coarse": None, "activation": activation,
     }  # fmt: skip
     entering = 9 if half_vector else 6
     plans = {"fine": (fine, (entering + fine, *hidden, 3))}

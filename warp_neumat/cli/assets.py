@@ -1,7 +1,6 @@
 """``neumat fit``, ``eval``, ``info``, ``decode``, ``export``: what is done to and with an asset."""
 
 import os
-import sys
 import time
 from pathlib import Path
 from typing import Annotated
@@ -10,6 +9,7 @@ import typer
 
 from warp_neumat.cli.common import Device, Out, Usage, app, progress_bar, start_warp, write_json
 from warp_neumat.cli.describe import describe
+from warp_neumat.cli.measure import figures, measure_brdf, measure_btf, measure_maps
 from warp_neumat.cli.values import (
     one_of,
     parse_crop,
@@ -32,13 +32,15 @@ def fit(
         typer.Argument(
             help="A folder of PBR maps or its .json manifest (model bcf); a MERL .binary, an RGL .bsdf, a .csv of "
             "samples, FILE.npz:NAME, analytic:ggx?roughness=0.2&f0=0.9,0.6,0.3, analytic:layered?… or "
-            "svbrdf:FOLDER, PBR maps as a reflectance (model neubrdf). "
+            "svbrdf:FOLDER, PBR maps as a reflectance (model neubrdf); a UBO2014 .btf, a UBO2003 .zip or its folder, "
+            "or simulated microgeometry:PATTERN?size=128&seed=0 with pattern weave, leather, carpet, wood or stone "
+            "(model btf). "
             "With --shared also FILE.npz, FILE.npz:'gold*', or a folder of measured files."
         ),
     ],
     out: Annotated[Path | None, typer.Option("-o", "--out", help="Asset to write, ending in .neumat.")] = None,
     model: Annotated[
-        str | None, typer.Option(help="Kind of material: bcf or neubrdf; default: the one that SOURCE is for.")
+        str | None, typer.Option(help="Kind of material: bcf, neubrdf or btf; default: the one that SOURCE is for.")
     ] = None,
     preset: Annotated[
         str | None,
@@ -51,7 +53,7 @@ def fit(
         str | None,
         typer.Option(
             help="bcf: longer sides of the feature textures instead of a preset, as 256,128,64,32 [texel]; neubrdf: "
-            "width of a primitive, as 16."
+            "width of a primitive, as 16; btf: how features are stored, half or bc6h."
         ),
     ] = None,
     budget: Annotated[
@@ -88,18 +90,20 @@ def fit(
         list[str] | None,
         typer.Option(
             help="Any other setting of the model or of its training, repeatable: wrap=clamp, modes=single, "
-            "batch=65536, nside=64, bits=9, hidden=64,64, frame=absolute, interpolation=uniform."
+            "batch=65536, nside=64, bits=9, hidden=64,64, frame=absolute, interpolation=uniform; btf: variant=neumip, "
+            "teacher=none, teacher=FILE.neumat, mips=1, schedule=plateau."
         ),
     ] = None,
     device: Device = "cpu",
 ):
-    """Fit a material to PBR maps or a reflectance function.
+    """Fit a material to PBR maps, a reflectance function or a bidirectional texture function.
 
     \b
     neumat fit bricks/ -o bricks.neumat --preset 1k
     neumat fit bricks/ -o bricks.neumat --crop 0,0,512,512 --override normal.orientation=dx
     neumat fit FILE.npz:alum-bronze -o bronze.neumat
     neumat fit FILE.npz --shared metals/
+    neumat fit 'microgeometry:weave?size=128' -o weave.neumat
     """
     if (out is None) == (shared is None):
         raise Usage("give either -o FILE.neumat, or --shared DIR for many materials")
@@ -117,7 +121,6 @@ def fit(
         "size": None if size is None else parse_set_size(size),
         "crop": None if crop is None else parse_crop(crop),
         "overrides": parse_overrides(override or []) or None,
-        "features": None if features is None else parse_features(features),
         "bytes": budget,
     }
     config |= {name: value for name, value in opening.items() if value is not None}
@@ -125,6 +128,7 @@ def fit(
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     start_warp(device)
     from warp_neumat.models import REGISTRY
+    from warp_neumat.simulation.open_btf import is_btf_spec
     from warp_neumat.training import fit as training
 
     if shared is not None:
@@ -134,8 +138,10 @@ def fit(
         raise Usage(f"--reciprocal is for model neubrdf, not {model}")
     if preset is not None:
         one_of("--preset", preset, training.presets(model))
-    if model == "neubrdf" and features is not None and len(config["features"]) == 1:
-        config["features"], opening["features"] = config["features"][0], None  # the width of a primitive
+    if is_btf_spec(source) and model != "btf":
+        raise Usage(f"{source} is a bidirectional texture function, which is for model btf, not {model}")
+    if features is not None:
+        config["features"] = _features(features, model)
     textured = model == "neubrdf" and source.startswith("svbrdf:")
     for name in opening if model != "bcf" else ():
         if textured and name in ("size", "crop", "overrides"):
@@ -162,7 +168,17 @@ def fit(
             announce=lambda text: print(text, flush=True),
             **config,
         )
-    print(f"{out}: {_figures(header.get('metrics', {}))} ({time.perf_counter() - start:.0f} s)")
+    print(f"{out}: {figures(header.get('metrics', {}))} ({time.perf_counter() - start:.0f} s)")
+
+
+def _features(text: str, model: str):
+    """Return what ``--features`` stands for: sides, the width of a primitive, or a way to store them."""
+    if model == "btf":
+        return one_of("--features", text, ("half", "bc6h"))
+    numbers = parse_features(text)
+    if model == "neubrdf" and len(numbers) > 1:
+        raise Usage(f"--features must be one width of a primitive for model neubrdf, as 16, got {text!r}")
+    return numbers[0] if model == "neubrdf" else numbers
 
 
 def _fit_shared(source, folder: Path, groups, preset, steps, seed, resume, device, config) -> None:
@@ -185,12 +201,7 @@ def _fit_shared(source, folder: Path, groups, preset, steps, seed, resume, devic
             **config,
         )
     for name, header in headers.items():
-        print(f"{folder / name}.neumat: {header['group']['file']}, {_figures(header['metrics'])}")
-
-
-def _figures(record: dict) -> str:
-    numbers = {k: v for k, v in record.items() if isinstance(v, (int, float))}
-    return ", ".join(f"{k} {v}" if isinstance(v, int) else f"{k} {v:.4g}" for k, v in numbers.items())
+        print(f"{folder / name}.neumat: {header['group']['file']}, {figures(header['metrics'])}")
 
 
 @app.command("eval")
@@ -202,7 +213,8 @@ def evaluate(
         Path | None,
         typer.Option(
             help="Write source, asset and ten times their difference side by side to this PNG, then for a bcf with "
-            "baselines BC at half resolution and its difference; a row a map."
+            "baselines BC at half resolution and its difference, a row a map; of a btf, a column for each of six "
+            "slices, and below them the apparent BRDF of the central texel."
         ),
     ] = None,
     baselines: Annotated[
@@ -220,6 +232,7 @@ def evaluate(
     \b
     neumat eval bricks.neumat --against bricks/ --json bricks.json
     neumat eval bronze.neumat --against FILE.npz:alum-bronze --picture sphere.png
+    neumat eval weave.neumat --against 'microgeometry:weave?size=128' --picture weave.png
     """
     if no_baselines and baselines:
         raise Usage("--baselines and --no-baselines: give one of them")
@@ -232,70 +245,17 @@ def evaluate(
     material = load(asset, device=device)
     if material.kind == "bcf":
         names = False if no_baselines else True if baselines is None else [b.strip() for b in baselines.split(",")]
-        record, text = _evaluate_maps(material, against, names, picture)
+        record, text = measure_maps(material, against, names, picture)
     elif baselines or no_baselines:
         raise Usage(f"--baselines are for a bcf; {asset} is of kind {material.kind}")
     else:
-        record, text = _evaluate_brdf(material, against, picture)
+        measure = measure_btf if material.kind == "btf" else measure_brdf
+        record, text = measure(material, against, picture)
     write_json(record, json_file)
     if json_file != "-":
-        print(f"{asset}: {_figures(record)}")
+        print(f"{asset}: {figures(record)}")
         if text:
             print(text)
-
-
-def _evaluate_brdf(material, against: str, picture: Path | None) -> tuple[dict, str]:
-    from warp_neumat.io.svbrdf import PREFIX, is_spatial
-    from warp_neumat.training import spatial
-    from warp_neumat.training.evaluate import brdf_metrics, sphere_strip
-    from warp_neumat.training.fit import BRDFData
-    from warp_neumat.training.plane import plane_strip
-
-    opening = material.header.get("source", {}).get("opening", {}) if against.startswith(PREFIX) else {}
-    source = BRDFData.open(against, **{k: opening[k] for k in BRDFData.OPTIONS if k in opening})
-    varies = is_spatial(source)
-    if material.textured and not varies:
-        raise Usage(f"{material.name} varies over a surface; --against must be {PREFIX}FOLDER, got {against!r}")
-    evaluate = spatial.material_on_source_levels(source, material) if varies else material.brdf
-    record = {"kind": material.kind, "bytes": material.bytes, **brdf_metrics(source, evaluate)}
-    if (own := material.header.get("own_bytes")) is not None:
-        sharers = material.header.get("metrics", {}).get("sharers")
-        record |= {"bytes_own": own, "bytes_shared": material.bytes - own, "sharers": sharers}
-    if varies:
-        record["bits_per_texel"] = spatial.bits_per_texel(source, material.bytes)
-    if picture is not None:
-        from warp_neumat.io.image import write_png
-
-        write_png(picture, plane_strip(source, evaluate) if varies else sphere_strip(source.eval, evaluate))
-    return record, "\n".join(
-        f"level {mip['lod']}: {_figures({k: v for k, v in mip.items() if k != 'lod'})}"
-        for mip in record.get("mips", ())
-    )
-
-
-def _evaluate_maps(material, against: str, baselines, picture: Path | None) -> tuple[dict, str]:
-    from warp_neumat.io.texture_set import open_texture_set
-    from warp_neumat.training.baselines import METHODS
-    from warp_neumat.training.evaluate_maps import contact_sheet, eval_record, format_table
-
-    for name in baselines if isinstance(baselines, list) else ():
-        one_of("--baselines", name, METHODS)
-    opening = material.header.get("source", {}).get("opening", {})
-    source = open_texture_set(against, **{k: opening[k] for k in ("size", "crop", "overrides") if k in opening})
-    with progress_bar(f"eval {material.name}") as progress:
-        try:
-            record = eval_record(source, material, baselines, progress=progress)
-        except ImportError as error:
-            if baselines is not True:
-                raise
-            print(f"note: no baselines: {error}", file=sys.stderr)
-            record = eval_record(source, material, False, progress=progress)
-    if picture is not None:
-        from warp_neumat.io.image import write_png
-
-        beside = "bc_half" if "bc_half" in record["baselines"] else None
-        write_png(picture, contact_sheet(source, material, baseline=beside))
-    return record, format_table(record)
 
 
 @app.command()

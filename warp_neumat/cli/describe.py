@@ -5,6 +5,8 @@ import math
 
 def describe(header: dict, tensors: dict) -> list[str]:
     """Return the lines of an asset's header and tensors (name → dtype, shape, bytes), by kind."""
+    if header["kind"] == "btf":
+        return _btf(header, tensors)
     lines = _maps(header.get("config", {}), tensors) if header["kind"] == "bcf" else _fields(header, "config")
     for part in ("group", "source", "training", "metrics"):
         lines += _fields(header, part)
@@ -23,6 +25,49 @@ def _fields(header: dict, part: str) -> list[str]:
         for key, value in found
         if value is not None
     ]
+
+
+def _btf(header: dict, tensors: dict) -> list[str]:
+    """Return what a btf is made of: size, networks from input to output, textures; where it comes from; how close."""
+    config, source, training = header["config"], header.get("source", {}), header.get("training", {})
+    width, height, angles = config["width"], config["height"], 9 if config["half_vector"] else 6
+    size = sum(t["bytes"] for t in tensors.values())
+    lines = [f"  material: {width}×{height}, {config['mips']} mips, {8 * size / (width * height):.4g} bit/texel"]
+    coarse, fine = config["coarse"], config["fine"]
+    nets = {"fine": [(coarse["latent"] if coarse else angles) + fine["channels"], *fine["hidden"], 3]}
+    if coarse:
+        nets = {"coarse": [angles + coarse["channels"], *coarse["hidden"], coarse["latent"]]} | nets
+    for name, widths in nets.items():
+        own = {key: sum(t["bytes"] for n, t in tensors.items() if n.startswith(f"{name}.{key}")) for key in _PARTS}
+        weights = sum(i * o + o for i, o in zip(widths[:-1], widths[1:], strict=True))
+        lines.append(
+            f"  {name}: {'→'.join(map(str, widths))}, {weights} weights, {own['weight'] + own['bias']} bytes; "
+            f"{config[name]['channels']} features a texel, {config['features']}, {own['mip'] + own['block']} bytes"
+        )
+    if "spec" in source:
+        lines.append(f"  source: {source['spec']}")
+    taught = training.get("teacher")
+    if isinstance(taught, dict):
+        lines.append("  teacher: " + ", ".join(f"{k} {_short(v)}" for k, v in taught.items()))
+    history = training.get("test_l1") or []
+    if history:
+        lines.append(f"  test l1: {_short(history[0])} → {_short(history[-1])} [1/sr] in {len(history)} epochs")
+    kept = {k: v for k, v in training.items() if k not in ("teacher", "test_l1")}
+    for part, fields in (("training", kept), ("metrics", header.get("metrics", {}))):
+        lines += [f"  {part}.{name}: {_short(value)}" for name, value in fields.items() if value is not None]
+    return lines + [f"  note: {note}" for note in source.get("notes", [])]
+
+
+_PARTS = ("weight", "bias", "mip", "block")
+"""How names of a network's tensors go on after its own."""
+
+
+def _short(value) -> str:
+    if isinstance(value, (list, tuple)):
+        return ", ".join(map(_short, value))
+    if isinstance(value, dict):
+        return ", ".join(f"{name} {_short(part)}" for name, part in value.items())
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def _maps(config: dict, tensors: dict) -> list[str]:

@@ -53,6 +53,8 @@ class Layout:
     latent: int = 8
     """Outputs of the coarse network."""
     half_vector: bool = True
+    activation: str = "hardswish"
+    """Of the hidden layers and the latents, one of :data:`btf_code.ACTIVATIONS`."""
 
     @staticmethod
     def padded(channels: int) -> int:

@@ -54,7 +54,21 @@ auto least = [](V8 s, V8 t) __attribute__((always_inline)) {{ return s < t ? s :
 """
 
 
-def layer(inputs: int, outputs: int, weights: str, source: str, target: str, vector: int, *, relu=True, start=None):
+ACTIVATIONS = {
+    "relu": "return s > {zero} ? s : {zero};",
+    "hardswish": "const {type} t = s * 0.16666667f + 0.5f, low = t > {zero} ? t : {zero};"
+    " return s * (low < {zero} + 1.0f ? low : {zero} + 1.0f);",
+}
+"""What a hidden layer does to its sums s: max(s, 0), or s · clamp(s/6 + 1/2, 0, 1)."""
+
+
+def activation_code(name: str, kind: str) -> str:
+    """Return C++ of ``act(s)`` for numbers of type ``kind``, ``V`` or ``float``."""
+    body = ACTIVATIONS[name].format(type=kind, zero="V{}" if kind == "V" else "0.0f")
+    return f"auto act = []({kind} s) __attribute__((always_inline)) {{ {body} }}; (void)act;"
+
+
+def layer(inputs: int, outputs: int, weights: str, source: str, target: str, vector: int, *, hidden=True, start=None):
     """Return C++ of one layer over a row: ``target`` [outputs][ROW] from ``source`` [inputs][ROW].
 
     Args:
@@ -62,7 +76,7 @@ def layer(inputs: int, outputs: int, weights: str, source: str, target: str, vec
         weights: C++ of where its transposed weights [inputs][outputs] lie; without ``start``, its biases before them.
         source, target: C++ of pointers.
         vector: Floats of a register.
-        relu: Whether negative sums become 0.
+        hidden: Whether sums go through ``act``.
         start: C++ of what sums begin with, [outputs][ROW]; None = the biases; "0" = nothing.
     """
     registers = ROW // vector
@@ -84,7 +98,7 @@ def layer(inputs: int, outputs: int, weights: str, source: str, target: str, vec
             text.append(f"{{ const float s = wk[{b}];{adds} }}")
         text.append("}")
         for b, u in cells:
-            value = f"(a{b}_{u} > 0.0f ? a{b}_{u} : Z)" if relu else f"a{b}_{u}"
+            value = f"act(a{b}_{u})" if hidden else f"a{b}_{u}"
             text.append(f"*(V*)({target} + (o + {b}) * {ROW} + {u} * NV) = {value};")
         text.append("}")
     return "\n".join([*text, "}"])
@@ -95,7 +109,7 @@ def batch(widest: int) -> int:
     return 4 if widest <= 32 else 1
 
 
-def tail(widths, weights: int, target: str, count: str, pitch: int, vector: int, *, relu: bool) -> str:
+def tail(widths, weights: int, target: str, count: str, pitch: int, vector: int, *, hidden: bool) -> str:
     """Return C++ of the layers behind the first one, for rows 0 … ``count`` − 1 of the buffers h0 and h1, from h0 on.
 
     Args:
@@ -105,13 +119,13 @@ def tail(widths, weights: int, target: str, count: str, pitch: int, vector: int,
         count: C++ of the number of rows.
         pitch: Words of a row in the buffers.
         vector: Floats of a register.
-        relu: Whether negative results become 0.
+        hidden: Whether the results go through ``act``.
     """
     text, layers = [], list(zip(widths[:-1], widths[1:], strict=True))
     for n, (i, o) in enumerate(layers):
         last = n == len(layers) - 1
         source, to = f"(h{n % 2} + t * {pitch})", target if last else f"(h{1 - n % 2} + t * {pitch})"
-        body = layer(i, o, f"(w + {weights})", source, to, vector, relu=relu if last else True)
+        body = layer(i, o, f"(w + {weights})", source, to, vector, hidden=hidden if last else True)
         text.append(f"for (int t = 0; t < {count}; ++t) {body}")
         weights += o + i * o
     return "\n".join(text)

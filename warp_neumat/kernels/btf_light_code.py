@@ -1,6 +1,6 @@
 """C++ of a neural BTF's light: the layers behind what the view has left in its rows and groups (``btf_code``)."""
 
-from warp_neumat.kernels.btf_code import batch, layer, table_code, tail, vector_types
+from warp_neumat.kernels.btf_code import activation_code, batch, layer, table_code, tail, vector_types
 
 # Writes the half vector behind a row's ω_i; o is ω_o.
 _HALF = """
@@ -91,7 +91,8 @@ def light_code(layout, lanes: int, vector: int) -> str:
     widest = max(*fine.hidden, *((*coarse.hidden, layout.latent) if coarse else ()))
     pitch = f"({widest} * ROW)"
     text = [
-        vector_types(vector), "const float* const w = weights.data + weight_at;", table_code(layout, lanes),
+        vector_types(vector), activation_code(layout.activation, "V"),
+        "const float* const w = weights.data + weight_at;", table_code(layout, lanes),
         _LIT, _HALF if layout.half_vector else "", _FINISH,
         f"enum {{ BATCH = {batch(widest)} }};",
         f"alignas(64) float h0[BATCH * {pitch}], h1[BATCH * {pitch}], y[4 * 3 * ROW], a[6 * ROW];",
@@ -120,7 +121,7 @@ for (int first = 0; first < count_lit; first += BATCH) {{
         {half}
         {begin}
     }}
-    {tail((*fine.hidden, 3), layout.at("fine tail"), "(y + t * 3 * ROW)", "rows", pitch, vector, relu=False)}
+    {tail((*fine.hidden, 3), layout.at("fine tail"), "(y + t * 3 * ROW)", "rows", pitch, vector, hidden=False)}
     for (int t = 0; t < rows; ++t) {{
         const int* const at = lane + list[first + t] * ROW;
         float* const from = y + t * 3 * ROW;
@@ -142,10 +143,10 @@ def _coarse(layout, lanes: int, vector: int, pitch: str) -> str:
     begin = layer(6 if half else 3, coarse.hidden[0], f"(w + {layout.at('coarse light')})", "a",
                   f"(h0 + t * {pitch})", vector, start=start)  # fmt: skip
     spread = layer(latent, wide, f"(w + {layout.at('latent')})", f"(z + t * {latent} * ROW)",
-                   f"(share + t * {wide} * ROW)", vector, relu=False, start="0")  # fmt: skip
+                   f"(share + t * {wide} * ROW)", vector, hidden=False, start="0")  # fmt: skip
     inner = tail((*coarse.hidden, latent), layout.at("coarse tail"), f"(z + t * {latent} * ROW)", "some", pitch,
-                 vector, relu=True)  # fmt: skip
-    outer = tail((*fine.hidden, 3), layout.at("fine tail"), "(out + t * 3 * ROW)", "many", pitch, vector, relu=False)
+                 vector, hidden=True)  # fmt: skip
+    outer = tail((*fine.hidden, 3), layout.at("fine tail"), "(out + t * 3 * ROW)", "many", pitch, vector, hidden=False)
     return f"""
 {_SUMS}
 {_STORE_QUADS}
@@ -186,7 +187,7 @@ for (int first = 0; first < count_lit; first += BATCH) {{
                 _Pragma("clang loop unroll_count(4)")
                 for (int i = 0; i < {wide} * ROW; i += NV) {{
                     const V s = *(const V*)(own_sum + i) + *(const V*)(both + i);
-                    *(V*)(to + i) = s > 0.0f ? s : Z;
+                    *(V*)(to + i) = act(s);
                 }}
             }}
             {outer}

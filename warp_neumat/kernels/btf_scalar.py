@@ -3,7 +3,7 @@
 A block is one lane, which is then its own item, or the four of one quad.
 """
 
-from warp_neumat.kernels.btf_code import LEVEL, SEAM, table_code
+from warp_neumat.kernels.btf_code import LEVEL, SEAM, activation_code, table_code
 
 _FETCH = """
 auto finite = [](float a) -> float { return a - a == 0.0f ? a : 0.0f; };
@@ -43,22 +43,22 @@ auto fetch = [&](float u, float v, int level, int column, int padded, int channe
 """.replace("LEVEL", str(LEVEL))
 
 _LAYER = """
-auto dense = [](const float* w, const float* start, const float* x, int inputs, int outputs, bool relu, float* y) {
+auto dense = [&](const float* w, const float* start, const float* x, int inputs, int outputs, bool hidden, float* y) {
     for (int o = 0; o < outputs; ++o) {
         float a = start ? start[o] : 0.0f;
         for (int k = 0; k < inputs; ++k) a += w[k * outputs + o] * x[k];
-        y[o] = relu && !(a > 0.0f) ? 0.0f : a;
+        y[o] = hidden ? act(a) : a;
     }
 };
 """
 
 
-def _tail(widths, weights: int, relu: bool) -> str:
+def _tail(widths, weights: int, hidden: bool) -> str:
     """Return C++ of the layers behind the first, from h0; the result is in ``last``."""
     text, source = ["const float* last = h0;"], 0
     layers = list(zip(widths[:-1], widths[1:], strict=True))
     for n, (i, o) in enumerate(layers):
-        used = "true" if relu or n < len(layers) - 1 else "false"
+        used = "true" if hidden or n < len(layers) - 1 else "false"
         text.append(f"dense(w + {weights + o}, w + {weights}, h{source}, {i}, {o}, {used}, h{1 - source});")
         source, weights = 1 - source, weights + o + i * o
         text.append(f"last = h{source};")
@@ -69,7 +69,7 @@ def view_code(layout, lanes: int) -> str:
     """Return C++ that prepares a block for its lights."""
     fine, coarse = layout.fine, layout.coarse
     most = 3 + max(fine.channels, coarse.channels if coarse else 0)
-    text = [_FETCH, _LAYER, table_code(layout, lanes), f"float x[{most}];"]
+    text = [_FETCH, activation_code(layout.activation, "float"), _LAYER, table_code(layout, lanes), f"float x[{most}];"]
     if not coarse:
         text.append(f"""
 for (int j = 0; j < count; ++j) {{
@@ -135,6 +135,7 @@ def light_code(layout, lanes: int) -> str:
 """
     head = f"""
 const float* const w = weights.data + weight_at;
+{activation_code(layout.activation, "float")}
 {_LAYER}
 {table_code(layout, lanes)}
 float h0[{widest}], h1[{widest}], a[6];
@@ -175,7 +176,7 @@ for (int j = 0; j < count; ++j) {{
     }}
     for (int k = 0; k < {wide}; ++k) {{
         const float s = fine[{wide} * l + k] + share[k];
-        h0[k] = s > 0.0f ? s : 0.0f;
+        h0[k] = act(s);
     }}
     {fine_tail} give(last, l);
 }}

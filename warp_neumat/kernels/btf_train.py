@@ -51,6 +51,8 @@ class StepShape:
     """Of the coarse texture; 0 = there is no coarse network."""
     coarse: tuple[int, ...] = ()
     """Widths of the coarse network's layers, the latents last."""
+    activation: str = "hardswish"
+    """``"hardswish"`` or ``"relu"``."""
 
     @property
     def coarse_rows(self) -> tuple[int, ...]:
@@ -106,7 +108,9 @@ class StepShape:
     @property
     def scratch(self) -> int:
         """Float32 words of scratch a part needs."""
-        activations = 2 * QUADS * sum(self.coarse_rows) + 2 * TEXELS * sum(self.fine_rows)
+        activations = 3 * QUADS * sum(self.coarse_rows) + 3 * TEXELS * sum(
+            self.fine_rows
+        )  # values, derivatives, slopes
         return activations + 3 * TEXELS + 8 * (QUADS + TEXELS) + self.weights + 64
 
     @property
@@ -148,21 +152,22 @@ def _scatter(channels: int, source: str) -> str:
     )
 
 
-def _forward(prefix: str, rows, count: int, layers) -> str:
+def _forward(prefix: str, rows, count: int, layers, activation: str) -> str:
     text = []
     for n, (_, _, _, bias, weights) in enumerate(layers):
         text.append(
             product(
                 a=f"{prefix}A{n}", row=rows[n], step=1, rows=count, depth=rows[n], b=f"(net + {weights})",
                 stride=rows[n + 1], columns=rows[n + 1], out=f"{prefix}A{n + 1}", width=rows[n + 1],
-                start=f"(net + {bias})", relu=True,
+                start=f"(net + {bias})", relu=activation == "relu",
+                hardswish=f"{prefix}S{n + 1}" if activation == "hardswish" else None,
             )
         )  # fmt: skip
     return "\n".join(text)
 
 
-def _backward(prefix: str, rows, count: int, layers, first: int, end: int) -> str:
-    """C++ of gradients by layers ``end`` − 1 … ``first``, where D{end} is the masked derivative; leaves D{first}."""
+def _backward(prefix: str, rows, count: int, layers, first: int, end: int, activation: str) -> str:
+    """C++ of gradients by layers ``end`` − 1 … ``first``, where D{end} is by the sums; leaves D{first}."""
     text = []
     for n in reversed(range(first, end)):
         _, _, _, bias, weights = layers[n]
@@ -180,10 +185,19 @@ def _backward(prefix: str, rows, count: int, layers, first: int, end: int) -> st
         text.append(
             product(
                 a=f"{prefix}D{n + 1}", row=out, step=1, rows=count, depth=out, b=f"{prefix}T{n}", stride=rows[n],
-                columns=rows[n], out=f"{prefix}D{n}", width=rows[n], mask=f"{prefix}A{n}" if n else None,
+                columns=rows[n], out=f"{prefix}D{n}", width=rows[n],
+                mask=f"{prefix}A{n}" if n and activation == "relu" else None,
+                slope=f"{prefix}S{n}" if n and activation == "hardswish" else None,
             )
         )  # fmt: skip
     return "\n".join(text)
+
+
+def _by_sum(activation: str, prefix: str, n: int, at: str, value: str) -> str:
+    """C++ of ``value``, a derivative by layer n's activations, times theirs by its sums."""
+    if activation == "relu":
+        return f"select(*(const V*)({prefix}A{n} + {at}) > 0.0f, {value}, Z)"
+    return f"({value}) * *(const V*)({prefix}S{n} + {at})"
 
 
 def _hint(number: int, activations: str, size: int) -> str:
@@ -223,6 +237,7 @@ def _cpu_code(shape: StepShape) -> str:
             text.append(
                 f"float* const {prefix}A{n} = at; at += {count * width};"
                 f"float* const {prefix}D{n} = at; at += {count * width};"
+                f"float* const {prefix}S{n} = at; at += {count * width};"
             )
     text.append(f"float* const Y = at; at += {3 * TEXELS};")
     text.append(f"int* const ctap = (int*)at; at += {4 * QUADS}; float* const cshare = at; at += {4 * QUADS};")
@@ -270,12 +285,12 @@ def _cpu_code(shape: StepShape) -> str:
     text.append(f"for (int j = {head + shape.channels}; j < {fine[0]}; ++j) x[j] = 0.0f; }} }}")
     # Networks.
     if shape.coarse:
-        text.append(_forward("c", coarse, QUADS, above))
+        text.append(_forward("c", coarse, QUADS, above, shape.activation))
         text.append(
             f"for (int r = 0; r < {TEXELS}; ++r) for (int j = 0; j < {head}; ++j)"
             f" fA0[r * {fine[0]} + j] = cA{len(above)}[(r >> 2) * {coarse[-1]} + j];"
         )
-    text.append(_forward("f", fine, TEXELS, below))
+    text.append(_forward("f", fine, TEXELS, below, shape.activation))
     bias, weights = shape.output
     text.append(f"""
     for (int l = 0; l < {TEXELS}; ++l) {{
@@ -327,34 +342,36 @@ def _cpu_code(shape: StepShape) -> str:
             s0 += h * y0; s1 += h * y1; s2 += h * y2;
             V d = w0 * y0 + w1 * y1 + w2 * y2;
             if (slope2 > 0.0f) d += slope2 * *(const V*)(z2 + l * {last} + j);
-            *(V*)(fD{depth} + l * {last} + j) = select(h > 0.0f, d, Z);
+            *(V*)(fD{depth} + l * {last} + j) = {_by_sum(shape.activation, "f", depth, f"l * {last} + j", "d")};
         }}
         float* const g = gw + {weights} + j;
         *(V*)g += s0; *(V*)(g + {last}) += s1; *(V*)(g + {2 * last}) += s2;
     }}
     """)
     if shape.coarse:
-        text.append(_backward("f", fine, TEXELS, below, 0, depth))
+        text.append(_backward("f", fine, TEXELS, below, 0, depth, shape.activation))
         wide, end = coarse[-1], len(above)
         text.append(f"""
         for (int q = 0; q < {QUADS}; ++q) {{
-            float d[{wide}];
-            for (int j = 0; j < {wide}; ++j) d[j] = 0.0f;
-            for (int k = 0; k < 4; ++k) for (int j = 0; j < {head}; ++j) d[j] += fD0[(4 * q + k) * {fine[0]} + j];
-            if (slope1 > 0.0f) for (int j = 0; j < {wide}; ++j) d[j] += slope1 * z1[q * {wide} + j];
-            for (int j = 0; j < {wide}; ++j) cD{end}[q * {wide} + j] = cA{end}[q * {wide} + j] > 0.0f ? d[j] : 0.0f;
+            alignas(32) float s[{wide}];
+            for (int j = 0; j < {wide}; ++j) s[j] = 0.0f;
+            for (int k = 0; k < 4; ++k) for (int j = 0; j < {head}; ++j) s[j] += fD0[(4 * q + k) * {fine[0]} + j];
+            for (int j = 0; j < {wide}; j += 8) {{
+                V d = *(const V*)(s + j);
+                if (slope1 > 0.0f) d += slope1 * *(const V*)(z1 + q * {wide} + j);
+                *(V*)(cD{end} + q * {wide} + j) = {_by_sum(shape.activation, "c", end, f"q * {wide} + j", "d")};
+            }}
         }}
         """)
-        text.append(_backward("c", coarse, QUADS, above, 0, end))
+        text.append(_backward("c", coarse, QUADS, above, 0, end, shape.activation))
     else:
         wide = fine[shape.middle]
-        text.append(_backward("f", fine, TEXELS, below, shape.middle, depth))
+        text.append(_backward("f", fine, TEXELS, below, shape.middle, depth, shape.activation))
+        own = _by_sum(shape.activation, "f", shape.middle, "j", "slope1 * *(const V*)(z1 + j)")
         text.append(f"""
-        if (slope1 > 0.0f) for (int j = 0; j < {TEXELS * wide}; j += 8)
-            *(V*)(fD{shape.middle} + j)
-                += select(*(const V*)(fA{shape.middle} + j) > 0.0f, slope1 * *(const V*)(z1 + j), Z);
+        if (slope1 > 0.0f) for (int j = 0; j < {TEXELS * wide}; j += 8) *(V*)(fD{shape.middle} + j) += {own};
         """)
-        text.append(_backward("f", fine, TEXELS, below, 0, shape.middle))
+        text.append(_backward("f", fine, TEXELS, below, 0, shape.middle, shape.activation))
     # Scatter.
     text.append(
         f"for (int r = 0; r < {TEXELS}; ++r) {{ const int* const tap = ftap + 4 * r;"

@@ -144,7 +144,7 @@ for (int turn = 0; turn < groups + 2; ++turn) {{
     const int g = turn - 2;
     memcpy(x, view + g * 3 * ROW, 12 * ROW);
     filter(ring[g & 3], x + 3 * ROW);
-    {layer(3 + coarse.channels, first, f"(w + {layout.at('coarse view')})", "x", target, vector, relu=False)}
+    {layer(3 + coarse.channels, first, f"(w + {layout.at('coarse view')})", "x", target, vector, hidden=False)}
 }}
 }}"""
 
@@ -193,7 +193,7 @@ for (int turn = 0; turn < rows + 2; ++turn) {{
     const int r = turn - 2;
     const int* const from = lane + r * ROW; (void)from;{of_view}
     filter(ring[r & 3], x + {seen} * ROW);
-    {layer(seen + fine.channels, wide, f"(w + {layout.at('fine view')})", "x", target, vector, relu=False)}
+    {layer(seen + fine.channels, wide, f"(w + {layout.at('fine view')})", "x", target, vector, hidden=False)}
 }}
 """)
     return "\n".join(text)

@@ -10,9 +10,10 @@ typedef float V __attribute__((vector_size(32), aligned(4), may_alias));
 typedef int I8 __attribute__((vector_size(32), aligned(4), may_alias));
 const V Z = {};
 auto sum8 = [](V s) { return ((s[0] + s[4]) + (s[1] + s[5])) + ((s[2] + s[6]) + (s[3] + s[7])); };
+auto clamped = [](V x) { return __builtin_elementwise_min(__builtin_elementwise_max(x, V{}), V{} + 1.0f); };
 auto select = [](I8 m, V a, V b) { return (V)(((I8)a & m) | ((I8)b & ~m)); };
 """
-"""Types V and I8 of 8 lanes, zero Z, sum8(v), and select(mask, a, b)."""
+"""Types V and I8 of 8 lanes, zero Z, sum8(v), clamped(v) to [0, 1], and select(mask, a, b)."""
 
 
 def padded(width: int) -> int:
@@ -21,12 +22,29 @@ def padded(width: int) -> int:
 
 
 def product(
-    *, a, row, step, rows, depth, b, stride, columns, out, width, start="Z", mask=None, relu=False, add=False
+    *,
+    a,
+    row,
+    step,
+    rows,
+    depth,
+    b,
+    stride,
+    columns,
+    out,
+    width,
+    start="Z",
+    mask=None,
+    relu=False,
+    add=False,
+    hardswish=None,
+    slope=None,
 ) -> str:
     """C++ of out[r][o] = start + Σ_k a[r·row + k·step] · b[k·stride + o], 4 rows by 16 columns or 8 by 8 at a time.
 
     ``rows`` and ``columns`` are multiples of 8. ``start`` is the name of a row to start from, ``mask`` of a matrix like
-    ``out``: 0 is written where it is not above 0.
+    ``out``: 0 is written where it is not above 0. ``hardswish`` is where the slopes of that activation go, a matrix
+    like ``out``; ``slope`` one that the result is multiplied with.
     """
 
     def tile(vectors: int, tall: int, begin: int, end: int) -> str:
@@ -49,6 +67,13 @@ def product(
             value = f"s{r}_{u}"
             if relu:
                 value = f"select({value} > 0.0f, {value}, Z)"
+            cell = f"(r + {r}) * {width} + o + {8 * u}"
+            if hardswish:
+                text.append(f"{{ const V s = {value}, t = clamped(s * 0.16666667f + 0.5f);")
+                text.append(f"*(V*)({hardswish} + {cell}) = select((t > 0.0f) & (t < 1.0f), 2.0f * t - 0.5f, t);")
+                text.append(f"{value} = s * t; }}")
+            if slope:
+                value = f"{value} * *(const V*)({slope} + {cell})"
             if mask:
                 value = f"select(*(const V*)({mask} + (r + {r}) * {width} + o + {8 * u}) > 0.0f, {value}, Z)"
             text.append(f"*(V*){place} {'+=' if add else '='} {value};")

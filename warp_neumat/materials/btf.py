@@ -3,10 +3,11 @@
 The asset, version 1:
 
 - config: ``width``, ``height``, ``mips``; ``fine`` {channels, hidden}; ``coarse`` {channels, hidden, latent} or null, a
-  single level; ``half_vector``; ``features``, ``"half"`` or ``"bc6h"``;
-- ``fine.weight{n}`` (out, in), ``fine.bias{n}``, ``coarse.weight{n}``, ``coarse.bias{n}`` float16, ReLU after every
-  layer but the last of the fine network. Inputs of the coarse network: ω_i, ω_o, the half vector, the coarse features;
-  of the fine one: the coarse network's outputs, the fine features. A single level: the angles, the fine features;
+  single level; ``half_vector``; ``activation``, ``"relu"`` or ``"hardswish"``; ``features``, ``"half"`` or ``"bc6h"``;
+- ``fine.weight{n}`` (out, in), ``fine.bias{n}``, ``coarse.weight{n}``, ``coarse.bias{n}`` float16, the
+  activation after every layer but the last of the fine network. Inputs of the coarse network: ω_i, ω_o, the half
+  vector, the coarse features; of the fine one: the coarse network's outputs, the fine features. A single level: the
+  angles, the fine features;
 - ``fine.mip{m}`` (h, w, channels) float16, ``coarse.mip{m}`` of half its size; for ``"bc6h"`` instead
   ``fine.block{t}.mip{m}`` (rows, columns, 16) uint8, signed BC6H, channels 3t … 3t + 2, decoded when opened.
 
@@ -20,7 +21,7 @@ import warp as wp
 
 from warp_neumat.io.asset import FormatError, expect
 from warp_neumat.io.block_formats import grid, mip_limit, mip_size
-from warp_neumat.kernels import arrays, dispatch
+from warp_neumat.kernels import arrays, btf_code, dispatch
 from warp_neumat.kernels import btf as kernels
 from warp_neumat.kernels.bc6h import bc6h_decode
 from warp_neumat.materials.base import Material, Shader
@@ -56,7 +57,7 @@ class BTF(Material):
             for net in (self.config["fine"], self.config["coarse"])
         )
         latent = self.config["coarse"]["latent"] if coarse else 0
-        self.layout = kernels.Layout(fine, coarse, latent, self.config["half_vector"])
+        self.layout = kernels.Layout(fine, coarse, latent, self.config["half_vector"], self.config["activation"])
         self.weights: int = self.layout.parameters
         """Number of network weights and biases."""
         weights, biases = {}, {}
@@ -189,10 +190,11 @@ def _checked(config, path) -> dict:
         rule = f"must be true or false, got {config.get('half_vector')!r}"
         raise FormatError(path, "config.half_vector", rule, _AGAIN)
     result["half_vector"] = config["half_vector"]
-    if config.get("features") not in FEATURES:
-        rule = f"must be one of {', '.join(FEATURES)}, got {config.get('features')!r}"
-        raise FormatError(path, "config.features", rule, _AGAIN)
-    result["features"] = config["features"]
+    for name, known in (("activation", tuple(btf_code.ACTIVATIONS)), ("features", FEATURES)):
+        if config.get(name) not in known:
+            rule = f"must be one of {', '.join(known)}, got {config.get(name)!r}"
+            raise FormatError(path, f"config.{name}", rule, _AGAIN)
+        result[name] = config[name]
     return result
 
 

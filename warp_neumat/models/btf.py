@@ -17,6 +17,7 @@ __all__ = ["BTF", "DATA", "DEFAULT_STEPS", "VERSION", "build", "configure", "fro
 DATA = "btf"
 VERSION = 1
 DEFAULT_STEPS = 12000
+ACTIVATIONS = {"relu": torch.relu, "hardswish": nn.functional.hardswish}
 CORNERS = ((-0.5, -0.5), (0.5, -0.5), (-0.5, 0.5), (0.5, 0.5))
 """The four places of a quad, in units of their distance: upper left, upper right, lower left, lower right."""
 
@@ -37,7 +38,9 @@ class BTF(nn.Module):
     def __init__(self, config: BTFConfig, seed: int = 0, scale: float = 1.0, teacher: BTF | None = None):
         super().__init__()
         self.config, self.scale = config, float(scale)
-        self.shape = StepShape(config.angles, config.channels, config.hidden, config.coarse_channels, config.coarse)
+        self.shape = StepShape(
+            config.angles, config.channels, config.hidden, config.coarse_channels, config.coarse, config.activation
+        )
         generator = torch.Generator().manual_seed(seed)
         self.levels = _levels(config)
         words = sum(w * h * c for (_, w, h), c in zip(self.levels, self._level_channels(), strict=True))
@@ -113,19 +116,19 @@ class BTF(nn.Module):
         """
         level = place[:, 3].long()
         table = torch.tensor(self.levels, device=place.device)[level]
-        layers = self.layers()
+        layers, act = self.layers(), ACTIVATIONS[self.config.activation]
         z1, head = None, angles
         if self.config.coarse:
             z1 = torch.cat([angles, self._fetch(True, place[:, :2], level)], 1)
             for weight, bias in layers[: len(self.config.coarse)]:
-                z1 = torch.relu(z1 @ weight.T + bias)
+                z1 = act(z1 @ weight.T + bias)
             layers, head = layers[len(self.config.coarse) :], z1
         corner = torch.tensor(CORNERS, dtype=place.dtype, device=place.device)
         uv = place[:, None, :2] + corner * (place[:, 2:3] / table[:, 1:])[:, None]
         x = self._fetch(False, uv.flatten(0, 1), level.repeat_interleave(4))
         x = torch.cat([head.repeat_interleave(4, 0), x], 1)
         for number, (weight, bias) in enumerate(layers[:-1], 1):
-            x = torch.relu(x @ weight.T + bias)
+            x = act(x @ weight.T + bias)
             if z1 is None and number == self.shape.middle:
                 z1 = x
         weight, bias = layers[-1]

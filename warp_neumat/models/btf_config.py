@@ -10,8 +10,8 @@ from warp_neumat.io.block_formats import mip_limit
 VARIANTS = {
     "coarse-to-fine": {},
     "single-level": {"channels": 30, "hidden": (8,) * 7, "coarse_channels": 0, "coarse": ()},
-    "neumip": {"channels": 14, "hidden": (25,) * 5, "coarse_channels": 0, "coarse": ()},
-    "neumip-max": {"channels": 14, "hidden": (128,) * 5, "coarse_channels": 0, "coarse": ()},
+    "neumip": {"activation": "relu", "channels": 14, "hidden": (25,) * 5, "coarse_channels": 0, "coarse": ()},
+    "neumip-max": {"activation": "relu", "channels": 14, "hidden": (128,) * 5, "coarse_channels": 0, "coarse": ()},
     "teacher": {"channels": 16, "hidden": (128,) * 4, "coarse_channels": 0, "coarse": ()},
 }
 """Models of MobileVR §4.1, 4.3, 5.2 and 5.6 by name. ``single-level`` has the 779 weights of ``coarse-to-fine`` and as
@@ -22,6 +22,7 @@ ALONE = ("neumip", "neumip-max", "teacher")
 """Variants that are trained without a teacher by default."""
 
 FEATURES = ("half", "bc6h")
+ACTIVATIONS = ("relu", "hardswish")
 SCHEDULES = ("cosine", "plateau")
 _WIDEST = 256
 
@@ -48,6 +49,9 @@ class BTFConfig:
     """Widths of the coarse network's layers, the latents last; empty = single level."""
     half_vector: bool = True
     """Whether the networks see h beside ω_i and ω_o."""
+    activation: str = "hardswish"
+    """What follows a hidden layer: ``"hardswish"``, x · clamp(x/6 + 1/2, 0, 1), which multiplies where ReLU selects;
+    or ``"relu"``. The paper names none."""
     features: str = "half"
     """How features are stored: ``"half"``, or ``"bc6h"``, blocks at 3/16 of the bytes."""
     teacher: str = "auto"
@@ -101,7 +105,12 @@ class BTFConfig:
         if len(rates) != 2 or not 0 < rates[1] <= rates[0] <= 1:
             raise ValueError(f"lr must be the first and the last rate, as 4e-3,4e-5, got {self.lr!r}")
         object.__setattr__(self, "lr", rates)
-        for name, allowed in (("variant", tuple(VARIANTS)), ("features", FEATURES), ("schedule", SCHEDULES)):
+        for name, allowed in (
+            ("variant", tuple(VARIANTS)),
+            ("features", FEATURES),
+            ("schedule", SCHEDULES),
+            ("activation", ACTIVATIONS),
+        ):
             if getattr(self, name) not in allowed:
                 raise ValueError(f"{name} must be one of {', '.join(allowed)}, got {getattr(self, name)!r}")
         if not isinstance(self.half_vector, bool):
@@ -125,7 +134,7 @@ class BTFConfig:
         return {
             "width": self.width, "height": self.height, "mips": self.mips,
             "fine": {"channels": self.channels, "hidden": list(self.hidden)}, "coarse": coarse,
-            "half_vector": self.half_vector, "features": self.features,
+            "half_vector": self.half_vector, "activation": self.activation, "features": self.features,
         }  # fmt: skip
 
 
@@ -161,5 +170,5 @@ def from_header(config: dict) -> BTFConfig:
         channels=fine["channels"], hidden=tuple(fine["hidden"]),
         coarse_channels=coarse["channels"] if coarse else 0,
         coarse=(*coarse["hidden"], coarse["latent"]) if coarse else (),
-        half_vector=config["half_vector"], features=config["features"], teacher="none",
+        half_vector=config["half_vector"], activation=config["activation"], features=config["features"], teacher="none",
     )  # fmt: skip

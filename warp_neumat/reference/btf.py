@@ -10,7 +10,7 @@ import numpy as np
 
 from warp_neumat.reference.bc6h import bc6h_decode
 from warp_neumat.reference.bcf import bilinear
-from warp_neumat.reference.mlp import mlp
+from warp_neumat.reference.mlp import ACTIVATIONS, mlp
 
 SEAM = 4.0
 """A quad whose texels lie further apart than this [texels of its mip] is no quad: each lane is evaluated by itself."""
@@ -95,12 +95,12 @@ def btf(tensors: dict, config: dict, uv, wi, wo, level, *, uv_coarse=None) -> np
         level: Mip level, int, [n].
         uv_coarse: Where the coarse texture is read, [n, 2]; None = at ``uv``.
     """
-    mips = textures(tensors, config)
+    mips, how = textures(tensors, config), config["activation"]
     x = angles(wi, wo, config["half_vector"])
     if config["coarse"]:
         features = fetch(mips["coarse"], uv if uv_coarse is None else uv_coarse, level)
-        x = np.maximum(mlp(np.concatenate([x, features], 1), *layers(tensors, "coarse")), 0)
-    y = mlp(np.concatenate([x, fetch(mips["fine"], uv, level)], 1), *layers(tensors, "fine"))
+        x = ACTIVATIONS[how](mlp(np.concatenate([x, features], 1), *layers(tensors, "coarse"), how))
+    y = mlp(np.concatenate([x, fetch(mips["fine"], uv, level)], 1), *layers(tensors, "fine"), how)
     above = (np.asarray(wi)[:, 2:] > 0) & (np.asarray(wo)[:, 2:] > 0)
     return np.where(above, np.maximum(y, 0), 0)
 

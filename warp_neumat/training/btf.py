@@ -252,7 +252,9 @@ def _cost(config: BTFConfig) -> float:
     """Return what a training step costs, in multiply-adds and in units of a batch, roughly."""
     from warp_neumat.kernels.btf_train import StepShape
 
-    shape = StepShape(config.angles, config.channels, config.hidden, config.coarse_channels, config.coarse)
+    shape = StepShape(
+        config.angles, config.channels, config.hidden, config.coarse_channels, config.coarse, config.activation
+    )
     return 3.0 * shape.products + 2e4
 
 
