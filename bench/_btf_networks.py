@@ -109,6 +109,27 @@ def _directions(rng, shape) -> np.ndarray:
     return (d / np.linalg.norm(d, axis=-1, keepdims=True)).astype(np.float32)
 
 
+def quad_uv(quads: int) -> np.ndarray:
+    """Return uv (n, 4, 2) float32 of neighbouring texels of an atlas, row by row.
+
+    A texel of the atlas is 0.9 of the texture's, so that all four taps count.
+    """
+    number = np.arange(quads)
+    corner = np.stack([(2 * number) % SIDE, 2 * (2 * number // SIDE)], 1)[:, None] + [[0, 0], [1, 0], [0, 1], [1, 1]]
+    return (corner * (0.9 / SIDE)).astype(np.float32)
+
+
+def taps(uv: np.ndarray, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return rows (n, 4) int64 and weights (n, 4) float32 of the bilinear taps at ``uv`` (n, 2); a texture repeats."""
+    at = uv.astype(np.float64) % 1.0 * (width, height) - 0.5
+    low = np.floor(at)
+    fx, fy = (at - low).T
+    x, y = low.astype(np.int64).T
+    rows = np.stack([(y + dy) % height * width + (x + dx) % width for dy in (0, 1) for dx in (0, 1)], 1)
+    weights = np.stack([gy * gx for gy in (1 - fy, fy) for gx in (1 - fx, fx)], 1)
+    return rows, weights.astype(np.float32)
+
+
 class Run:
     """The networks of one of :data:`SHAPES` over ``texels`` texels; :meth:`call` evaluates them under some lights."""
 
@@ -121,9 +142,7 @@ class Run:
         self.material = BTF(self.tensors, header, device=device)
         blocks = dispatch.blocks(texels, lanes)
         self.texels = blocks * lanes
-        quads = np.arange(self.texels // 4)
-        corner = np.stack([(2 * quads) % SIDE, 2 * (2 * quads // SIDE)], 1)[:, None] + [[0, 0], [1, 0], [0, 1], [1, 1]]
-        self.uv = (corner * (0.9 / SIDE)).astype(np.float32)  # not texel for texel: all four taps count
+        self.uv = quad_uv(self.texels // 4)
         self.wo, self.wi = (_directions(rng, (LIGHTS, lanes // 4)).repeat(4, 1) for _ in range(2))
 
         def array(x, dtype=wp.float32):

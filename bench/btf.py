@@ -7,6 +7,7 @@ fit``. ``python -m bench.btf`` takes a choice (``--help``):
   the coarse network's (438 against NeuMIP's 3150: 7.2 times less); ``weights``: those stored, with biases;
   ``over_neumip``: the error over NeuMIP's; ``under_lafortune``: Lafortune's error over this one.
 - ``figure7``: test L1 over the epochs of a fit, ours beside NeuMIP; ``figure11``: ours with and without distillation.
+  Epoch 0 is before the first step.
 - ``figure13``: coarse-to-fine beside a single level of equal capacity, both distilled: error after equal steps, and
   time under 1 … 4 lights of fetches and networks alone, in turns in one process (``_btf_networks.py``).
 - ``figure10``: the texel-space shading stage over 1 … 8 lights on a sheet of 1200² texels, the line through the times,
@@ -31,11 +32,27 @@ from pathlib import Path
 
 from ._btf_lab import LAFORTUNE, MATERIALS, METHODS, NETWORKS, TABLES, Choice, Lab
 
-COLUMNS = [
-    "table", "material", "method", "epoch", "lights", "materials", "texels", "l1", "l1_relative", "over_neumip",
-    "under_lafortune", "bytes", "weights", "macs", "seconds", "ms", "evaluations", "slope_ms", "r2", "error", "peer",
-    "peer_ms", "ratio", "peer_error",
-]  # fmt: skip
+_TIMES = ("lights", "texels", "ms", "error", "peer", "peer_ms", "ratio", "peer_error")
+_STAGE = ("lights", "materials", "texels", "ms", "evaluations", "slope_ms", "r2")
+
+SHOWN = {
+    "table1": ("l1", "l1_relative", "over_neumip", "under_lafortune", "bytes", "weights", "macs", "seconds"),
+    "figure7": ("epoch", "l1"),
+    "figure11": ("epoch", "l1"),
+    "figure13": ("l1", "weights", "macs", *_TIMES),
+    "figure10": (*_STAGE, "peer", "peer_ms", "ratio"),
+    "table3": _STAGE,
+    "peers": _TIMES,
+}
+"""Table → columns beside its own, material and method."""
+
+
+def columns(only: tuple[str, ...]) -> list[str]:
+    """Return the columns of some tables, each once."""
+    return list(dict.fromkeys(["table", "material", "method", *(name for table in only for name in SHOWN[table])]))
+
+
+COLUMNS = columns(TABLES)
 
 
 def table1(lab: Lab):
@@ -70,7 +87,7 @@ def _curves(lab: Lab, table: str, methods: tuple[str, ...]):
     for material in lab.choice.materials:
         curves[material] = {method: lab.measure(material, method)["test_l1"] for method in methods}
         for method, values in curves[material].items():
-            for epoch, value in enumerate(values, 1):
+            for epoch, value in enumerate(values):
                 yield {"table": table, "material": _short(material), "method": method, "epoch": epoch, "l1": value}
     if lab.choice.plots is not None:
         _draw(lab.choice.plots / f"{table}.png", curves)
@@ -142,7 +159,7 @@ def _draw(path: Path, curves: dict[str, dict[str, list[float]]]) -> None:
     panels = figure.subplots(1, len(curves), squeeze=False)[0]
     for axes, (material, methods) in zip(panels, curves.items(), strict=True):
         for method, values in methods.items():
-            axes.plot(range(1, len(values) + 1), values, ".-", label=method)
+            axes.plot(range(len(values)), values, ".-", label=method)
         axes.set(title=_short(material), xlabel="epoch", ylabel="test L1 [1/sr]", yscale="log")
         axes.grid(alpha=0.3, which="both")
         axes.legend()
@@ -167,12 +184,18 @@ QUICK = {
 """What ``--quick`` chooses."""
 
 
-def rows(*, device: str, quick: bool, **choices):
-    """Yield the rows of the chosen tables; ``choices`` are fields of :class:`Choice`."""
+def _tables(device: str, quick: bool, choices: dict):
+    """Yield (name, rows) of the chosen tables."""
     lab = Lab(Choice(**({**QUICK, **choices} if quick else choices)), device)
     for table in TABLES:
         if table in lab.choice.only:
-            yield from globals()[table](lab)
+            yield table, globals()[table](lab)
+
+
+def rows(*, device: str, quick: bool, **choices):
+    """Yield the rows of the chosen tables; ``choices`` are fields of :class:`Choice`."""
+    for _, found in _tables(device, quick, choices):
+        yield from found
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -218,7 +241,11 @@ def main(arguments: list[str] | None = None) -> int:
         for path in (file, chosen.get("cache")):
             if path is not None:
                 check_writable(path)
-        document = run("btf", rows(device=device, quick=quick, **chosen), COLUMNS, Console(highlight=False))
+        console, document, found = Console(highlight=False), {}, []
+        for table, made in _tables(device, quick, chosen):
+            document = run(f"btf {table}", made, columns((table,)), console)
+            found += document["rows"]
+        document |= {"bench": "btf", "rows": found}
         if file:
             with replacing(file) as temporary:
                 temporary.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")

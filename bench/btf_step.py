@@ -145,17 +145,13 @@ class Problem:
         return torch.stack(found).amin(0) if margins else None
 
 
-def _taps(uv: np.ndarray, w: int, h: int):
-    """Return the rows (n, 4) int64 and weights (n, 4) float32 of bilinear taps of a texture that repeats."""
+def _taps(uv: np.ndarray, width: int, height: int):
+    """Return rows and weights of bilinear taps for torch."""
     import torch
 
-    at = uv.astype(np.float32).astype(np.float64) % 1.0 * (w, h) - 0.5
-    low = np.floor(at)
-    fx, fy = (at - low).T
-    x, y = low.astype(np.int64).T
-    rows = np.stack([(y + dy) % h * w + (x + dx) % w for dy in (0, 1) for dx in (0, 1)], 1)
-    weights = np.stack([gy * gx for gy in (1 - fy, fy) for gx in (1 - fx, fx)], 1)
-    return torch.from_numpy(rows), torch.from_numpy(weights.astype(np.float32))
+    from bench._btf_networks import taps
+
+    return tuple(torch.from_numpy(part) for part in taps(uv.astype(np.float32), width, height))
 
 
 def _errors(model, quads: int, taught: bool) -> tuple[float, float]:

@@ -28,6 +28,14 @@ def data() -> Path:
     return root
 
 
+@pytest.fixture(scope="session", autouse=True)
+def own_cache(tmp_path_factory):
+    """What tests keep between runs of the package lies in a folder of their own, never in the user's cache."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("NEUMAT_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
 @pytest.fixture
 def rng() -> np.random.Generator:
     return np.random.default_rng(20240)

@@ -11,7 +11,8 @@ def test_every_test_that_is_cited_exists():
     for file in (ROOT / "tests").rglob("test_*.py"):
         known |= set(re.findall(r"def (test_\w+)", file.read_text(encoding="utf-8"))) | {file.stem}
     texts = [*(ROOT / "warp_neumat").rglob("*.py"), *(ROOT / "docs").glob("*.md"), ROOT / "README.md"]
-    cited = {(f.name, name) for f in texts for name in re.findall(r"\btest_\w+", f.read_text(encoding="utf-8"))}
+    # A quoted name is data: the field of a header that holds errors on test samples.
+    cited = {(f.name, name) for f in texts for name in re.findall(r'(?<!")\btest_\w+', f.read_text(encoding="utf-8"))}
     assert len(cited) > 30
     assert sorted((f, n) for f, n in cited if n not in known) == []
 

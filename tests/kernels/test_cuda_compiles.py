@@ -1,4 +1,4 @@
-"""The kernels of rendering and of BCf training compile to PTX, without a GPU: one source serves both devices."""
+"""The kernels of rendering, BCf training and simulation compile to PTX, without a GPU: one source serves both."""
 
 import pytest
 import warp as wp
@@ -10,10 +10,13 @@ from warp_neumat.kernels import (
     bcf_shade,
     bcf_train,
     block_texture,
+    btf,
     frame,
     gather,
     ggx,
     healpix,
+    height_field,
+    height_field_light,
     lod,
     mlp,
     neubrdf,
@@ -59,6 +62,10 @@ def _shade_textured():
     return shade.make_shade_kernel(bcf_shade.functions, layout, 1, textured=True).module
 
 
+def _shade_btf():
+    return shade.make_shade_kernel(btf.functions, btf.Layout(), 1, textured=True).module
+
+
 def _bcf_step():
     return bcf_train.step_kernel(bcf_train.StepShape(textures=4, hidden=16, channels=9), 1).module
 
@@ -74,6 +81,14 @@ MODULES = {
     "shade_neubrdf_textured": _shade_neubrdf_textured,
     "ggx": lambda: ggx._make_kernel(1).module,
     "lod": lambda: lod.uv_gradient_kernel.module,
+    "btf_rows": lambda: btf.make_eval_kernel(btf.Layout(), 1, False).module,
+    "btf_quads": lambda: btf.make_eval_kernel(btf.Layout(), 4, True).module,
+    "shade_btf": _shade_btf,
+    "height_field": lambda: height_field._make_trace(1).module,
+    "height_field_direct": lambda: height_field_light._make_light(1)[0].module,
+    "height_field_bounce": lambda: height_field_light._make_light(1)[1].module,
+    "height_field_pack": lambda: height_field_light._make_light(1)[2].module,
+    "height_field_slices": lambda: height_field_light._make_slice(1, 2).module,
     "bcf_step": _bcf_step,
     "block_decode": lambda: block_texture.make_block_kernels()[0].module,
     "block_adjoint": lambda: block_texture.make_block_kernels()[1].module,

@@ -5,14 +5,17 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
+from tests.fake_assets import random_btf  # noqa: E402
 from warp_neumat.io.asset import FormatError, read_asset, write_asset  # noqa: E402
 from warp_neumat.io.btf_directions import ubo2003_directions  # noqa: E402
 from warp_neumat.io.cache import cache_folder  # noqa: E402
 from warp_neumat.materials import load  # noqa: E402
+from warp_neumat.materials.btf import BTF as Material  # noqa: E402
 from warp_neumat.models import btf  # noqa: E402
 from warp_neumat.simulation.open_btf import open_btf  # noqa: E402
 from warp_neumat.training import loop  # noqa: E402
-from warp_neumat.training.btf import BTFData, btf_metrics, mean_value, quad_places  # noqa: E402
+from warp_neumat.training.btf import BTFData, btf_metrics, mean_value  # noqa: E402
+from warp_neumat.training.btf_sheet import asset_slices  # noqa: E402
 from warp_neumat.training.fit import checkpoint_path, default_model, fit, presets  # noqa: E402
 from warp_neumat.training.loop import Plan, Trainer  # noqa: E402
 
@@ -119,19 +122,16 @@ def test_progress_goes_through_teacher_and_student(fitted):
     assert header["training"]["teacher"]["cached"] is False
 
 
-def test_metrics_are_of_texel_centres(fitted):
-    """The same L1 from whole slices of all texels, with the asset evaluated quad by quad."""
-    out, header, _, _ = fitted
-    source, material = open_btf(SPEC), load(out)
-    pairs = np.random.default_rng(2).integers(0, 81, (300, 2))
-    truth = source.slices(pairs).reshape(300, 8, 2, 8, 2, 3).swapaxes(2, 3).reshape(-1, 4, 3)
-    cells = np.stack([np.tile(np.arange(8), 8), np.repeat(np.arange(8), 8)], 1)
-    place = np.concatenate([(cells + 0.5) / 8, np.tile([1.0, 0.0], (64, 1))], 1).astype(np.float32)
-    uv, level = quad_places(source, np.tile(place, (300, 1)))
-    got = material.eval_quads(
-        uv, source.lights[pairs[:, 0]].repeat(64, 0), source.views[pairs[:, 1]].repeat(64, 0), level
-    )
-    assert np.abs(got - truth).mean() == pytest.approx(header["metrics"]["l1"], rel=0.1)
+def test_metrics_are_of_texel_centres():
+    """The same L1 from whole slices under other pairs, of an asset that is off everywhere alike."""
+    source = Ripples()
+    material = Material(*random_btf(np.random.default_rng(0), width=16, height=16))
+    pairs = np.random.default_rng(2).integers(0, 27, (400, 2))
+    apart = np.abs(asset_slices(source, material)(pairs) - source.slices(pairs))
+    found = btf_metrics(source, material)
+    assert found["l1"] == pytest.approx(apart.mean(), rel=0.03)
+    assert found["l1_relative"] == pytest.approx(apart.mean() / source.slices(pairs).mean(), rel=0.06)
+    assert len(found["levels"]) == 3
 
 
 # --- teachers ---------------------------------------------------------------------------------------------------------
@@ -230,7 +230,8 @@ def test_same_seed_same_tensors_other_seed_others(cache):
 @pytest.mark.parametrize("interrupted_in", ["teacher", "student"])
 def test_resumed_fit_equals_an_uninterrupted_one(tmp_path, monkeypatch, interrupted_in):
     plan = {"steps": 300, "checkpoint_seconds": 0.0}
-    options = {"teacher_steps": 300, "schedule": "plateau"}
+    options = {"teacher_steps": 300, "schedule": "plateau", "epochs": 4}
+    monkeypatch.setattr(loop, "PLATEAU", 1e9)  # every event halves the rate
     monkeypatch.setenv("NEUMAT_CACHE", str(tmp_path / "whole"))
     whole = make(tmp_path / "w", plan, **options)
     whole.run()
@@ -244,18 +245,20 @@ def test_resumed_fit_equals_an_uninterrupted_one(tmp_path, monkeypatch, interrup
             raise KeyboardInterrupt
 
     path = tmp_path / "c"
-    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+    first = make(path, plan, **options)
+    with monkeypatch.context() as patch:
         patch.setattr(Trainer, "_save", save_then_stop)
-        make(path, plan, **options).run()
+        with pytest.raises(KeyboardInterrupt):
+            first.run()
     assert path.is_file() == (interrupted_in == "student")
     assert bool(list(cache_folder().glob("*.checkpoint"))) == (interrupted_in == "teacher")
 
     second = make(path, plan, **options)
     assert second.resume()
-    steps = []
-    monkeypatch.setattr(Trainer, "_note", lambda trainer, stage, loss: steps.append(trainer._step))
+    steps, note = [], Trainer._note
+    monkeypatch.setattr(Trainer, "_note", lambda t, stage, loss: (steps.append(t._step), note(t, stage, loss)))
     facts = second.run()
-    assert min(steps) > 128  # it went on, and did not begin anew
+    assert steps[0] > 128  # it went on, and did not begin anew
     assert facts["teacher"]["cached"] is (interrupted_in == "student")
     assert_same(tensors_of(whole), tensors_of(second))
     assert whole.model.statistics() == second.model.statistics()

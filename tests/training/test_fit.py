@@ -137,7 +137,7 @@ def test_divergence_is_an_error():
         ({"seed": -1}, ValueError, "seed must be"),
         ({"budget_seconds": -2.0}, ValueError, "budget_seconds must be above 0"),
         ({"checkpoint_seconds": -1.0}, ValueError, "checkpoint_seconds must be at least 0"),
-        ({"model": "bfc"}, ValueError, "no model 'bfc'; nearest: bcf"),
+        ({"model": "bcff"}, ValueError, "no model 'bcff'; nearest: bcf"),
         ({"device": "cuda:99"}, ValueError, "device 'cuda:99' cannot be used"),
         ({"device": "gpu"}, ValueError, "device 'gpu' cannot be used"),
         ({"out": "missing/a.neumat"}, FileNotFoundError, "no folder"),

@@ -142,6 +142,8 @@ def fit(
         raise Usage(f"{source} is a bidirectional texture function, which is for model btf, not {model}")
     if features is not None:
         config["features"] = _features(features, model)
+    if model == "btf" and (named := {"width", "height"} & set(config)):
+        raise Usage(f"--option {min(named)}: a btf has the size of its source, as microgeometry:weave?size=64")
     textured = model == "neubrdf" and source.startswith("svbrdf:")
     for name in opening if model != "bcf" else ():
         if textured and name in ("size", "crop", "overrides"):
@@ -241,8 +243,11 @@ def evaluate(
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     start_warp(device)
     from warp_neumat.materials import load
+    from warp_neumat.simulation.open_btf import is_btf_spec
 
     material = load(asset, device=device)
+    if is_btf_spec(against) and material.kind != "btf":
+        raise Usage(f"{against} is a bidirectional texture function, and {asset} is of kind {material.kind}")
     if material.kind == "bcf":
         names = False if no_baselines else True if baselines is None else [b.strip() for b in baselines.split(",")]
         record, text = measure_maps(material, against, names, picture)

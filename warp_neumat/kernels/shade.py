@@ -237,32 +237,38 @@ def make_shade_kernel(functions_of, layout, lanes: int, textured: bool = False):
         for j in range(lights.count):
             source = wp.vec3(lights.position[3 * j], lights.position[3 * j + 1], lights.position[3 * j + 2])
             power = wp.vec3(lights.intensity[3 * j], lights.intensity[3 * j + 1], lights.intensity[3 * j + 2])
+            facing = int(0)  # first, because a light behind all lanes is then nearly free
             for l in range(L):
-                n = wp.vec3(N[l], N[L + l], N[2 * L + l])
-                t = wp.vec3(T[l], T[L + l], T[2 * L + l])
-                s = wp.cross(n, t) * T[3 * L + l]
                 d = source - wp.vec3(P[l], P[L + l], P[2 * L + l])
-                w = to_local(safe_normalize(d), t, s, n)
-                # Inverse square; within a millionth of the unit of length the light is inside the surface.
-                gain = wp.max(w[2], 0.0)
-                if wp.static(textured):  # the cosine is that of the map's normal, which the material knows
-                    gain = wp.where(w[2] > 0.0, 1.0, 0.0)
-                e = chosen[l] * gain / wp.max(wp.dot(d, d), 1.0e-12)
-                I[l] = w[0]
-                I[L + l] = w[1]
-                I[2 * L + l] = wp.max(w[2], 0.0)
-                E[l] = e * power[0]
-                E[L + l] = e * power[1]
-                E[2 * L + l] = e * power[2]
+                z = wp.dot(wp.vec3(N[l], N[L + l], N[2 * L + l]), d)
+                facing += wp.where(z * chosen[l] > 0.0, 1, 0)
             lit = int(0)
-            for l in range(L):
-                if E[l] + E[L + l] + E[2 * L + l] > 0.0:
-                    active[lit] = l
-                    lit += 1
-            if lit > 0:
-                light(material, I, active, lit, own, Y)
-                for l in range(3 * L):
-                    R[l] = R[l] + E[l] * Y[l]
+            if facing > 0:
+                for l in range(L):
+                    n = wp.vec3(N[l], N[L + l], N[2 * L + l])
+                    t = wp.vec3(T[l], T[L + l], T[2 * L + l])
+                    s = wp.cross(n, t) * T[3 * L + l]
+                    d = source - wp.vec3(P[l], P[L + l], P[2 * L + l])
+                    w = to_local(safe_normalize(d), t, s, n)
+                    # Inverse square; within a millionth of the unit of length the light is inside the surface.
+                    gain = wp.max(w[2], 0.0)
+                    if wp.static(textured):  # the cosine is that of the map's normal, which the material knows
+                        gain = wp.where(w[2] > 0.0, 1.0, 0.0)
+                    e = chosen[l] * gain / wp.max(wp.dot(d, d), 1.0e-12)
+                    I[l] = w[0]
+                    I[L + l] = w[1]
+                    I[2 * L + l] = wp.max(w[2], 0.0)
+                    E[l] = e * power[0]
+                    E[L + l] = e * power[1]
+                    E[2 * L + l] = e * power[2]
+                for l in range(L):
+                    if E[l] + E[L + l] + E[2 * L + l] > 0.0:
+                        active[lit] = l
+                        lit += 1
+                if lit > 0:
+                    light(material, I, active, lit, own, Y)
+                    for l in range(3 * L):
+                        R[l] = R[l] + E[l] * Y[l]
             total += lit
         for l in range(L):
             if chosen[l] > 0.0:

@@ -62,7 +62,8 @@ class BTF(nn.Module):
     def _initial_net(self, generator) -> torch.Tensor:
         net = torch.zeros(self.shape.weights)
         for weight, _ in self.layers(net)[:-1]:
-            weight.normal_(generator=generator).mul_((2.0 / weight.shape[1]) ** 0.5)
+            gain = 2.0 if self.config.activation == "relu" else 4.5  # hard-swish is nearly linear near 0
+            weight.normal_(generator=generator).mul_((gain / weight.shape[1]) ** 0.5)
         weight, bias = self.layers(net)[-1]
         weight.normal_(generator=generator).mul_((0.25 / weight.shape[1]) ** 0.5)
         bias.fill_(1.0)
@@ -257,7 +258,7 @@ class BTF(nn.Module):
 
     def rates(self, parameters) -> list[float]:
         """Return the learning rate of each parameter in units of the stage's."""
-        return [3.0 if p is self.texels else 1.0 for p in parameters]
+        return [1.0 if p is self.texels else 1.0 for p in parameters]
 
     def event_samples(self) -> int:
         """Return the quads of the test error."""
