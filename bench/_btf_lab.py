@@ -139,7 +139,7 @@ class Lab:
             "weights": fitted.weights,
             "macs": multiply_adds(fitted.layout),
             "seconds": training["seconds"],
-            "teacher_seconds": training.get("teacher", {}).get("seconds"),
+            "teacher_seconds": training.get("teacher_seconds"),
             "teacher_l1": training.get("teacher", {}).get("l1"),
             "test_l1": training["test_l1"],
         }

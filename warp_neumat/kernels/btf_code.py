@@ -193,13 +193,23 @@ auto find = [&](const float* u, const float* v, const int* level, Taps& to) {{
     for (int i = 0; i < ROW; i += 8) {{
         auto axis = [](const float* x, I8 size, I8& x0, I8& x1) __attribute__((always_inline)) {{
             V8 a = *(const V8*)x;
-            a -= __builtin_elementwise_floor(a);
-            a = a >= 0.0f ? a : (V8){{}};  // one that is no number: 0
-            const V8 p = a * __builtin_convertvector(size, V8) - 0.5f, whole = __builtin_elementwise_floor(p);
+            a -= __builtin_elementwise_rint(a);  // -1/2 ... 1/2, exactly
+            a = a == a ? a : (V8){{}};  // one that is no number: 0
+            const V8 s = __builtin_convertvector(size, V8);
+            V8 whole = __builtin_elementwise_floor(a * s - 0.5f);
+            // The product, rounded, is as wrong as a texel is far from the middle; its remainder is not.
+#if defined(__FMA__)
+            V8 part = __builtin_elementwise_fma(a, s, -0.5f - whole);
+#else
+            V8 part = a * s - 0.5f - whole;
+#endif
+            whole = part < 0.0f ? whole - 1.0f : whole;  // where it was rounded up to a texel's centre
+            part = part < 0.0f ? part + 1.0f : part;
             x0 = __builtin_convertvector(whole, I8);
+            x0 = x0 < 0 ? x0 + size : x0;
             x1 = x0 + 1;
-            x0 = x0 < 0 ? size - 1 : x0; x1 = x1 < size ? x1 : (I8){{}};
-            return p - whole;
+            x1 = x1 < size ? x1 : (I8){{}};
+            return part;
         }};
         const I8 width = *(const I8*)(wide + i), height = *(const I8*)(high + i);
         I8 x0, x1, y0, y1;

@@ -79,7 +79,7 @@ for (int c = 0; c < 3; ++c) for (int q = 0; q < LANES / 4; q += 8) {
     V8 p[4];
     _Pragma("clang loop unroll(full)")
     for (int k = 0; k < 4; ++k)
-        p[k] = *(const V8*)(wi.data + c * LANES + 4 * q + 8 * k) * *(const V8*)(reached + 4 * q + 8 * k);
+        p[k] = *(const V8*)(reached + 4 * q + 8 * k) > 0.0f ? *(const V8*)(wi.data + c * LANES + 4 * q + 8 * k) : V8{};
     *(V8*)(sum + c * (LANES / 4) + q) = fold(p[0], p[1], p[2], p[3], plus);
 }
 """

@@ -7,7 +7,18 @@ from warp_neumat.kernels.btf_code import LEVEL, SEAM, activation_code, table_cod
 
 _FETCH = """
 auto finite = [](float a) -> float { return a - a == 0.0f ? a : 0.0f; };
-auto wrapped = [](float a) -> float { a -= floorf(a); return a >= 0.0f ? a : 0.0f; };  // one that is no number: 0
+// Texels on both sides of a coordinate, and its place between them; see btf_code.fetch_code.
+auto axis = [](float a, int size, int& x0, int& x1) -> float {
+    a -= rintf(a);
+    a = a == a ? a : 0.0f;  // one that is no number: 0
+    float whole = floorf(a * (float)size - 0.5f), part = fmaf(a, (float)size, -0.5f - whole);
+    whole = part < 0.0f ? whole - 1.0f : whole;
+    part = part < 0.0f ? part + 1.0f : part;
+    x0 = (int)whole;
+    x0 = x0 < 0 ? x0 + size : x0;
+    x1 = x0 + 1 < size ? x0 + 1 : 0;
+    return part;
+};
 auto half_of = [](unsigned short bits) -> float {
     // Shifted into place, a half is a float 2^112 too small, denormal ones included.
     const unsigned wide = (bits & 0x7FFFu) << 13;
@@ -27,11 +38,8 @@ auto level_of = [&](float s) -> int {
 auto fetch = [&](float u, float v, int level, int column, int padded, int channels, float* x) {
     const int* const rec = lv + 1 + LEVEL * level + column;
     const int width = rec[0], height = rec[1];
-    const float px = wrapped(u) * (float)width - 0.5f, py = wrapped(v) * (float)height - 0.5f;
-    const float ix = floorf(px), iy = floorf(py), fx = px - ix, fy = py - iy;
-    int x0 = (int)ix, y0 = (int)iy, x1 = x0 + 1, y1 = y0 + 1;
-    x0 = x0 < 0 ? width - 1 : x0; x1 = x1 < width ? x1 : 0;
-    y0 = y0 < 0 ? height - 1 : y0; y1 = y1 < height ? y1 : 0;
+    int x0, x1, y0, y1;
+    const float fx = axis(u, width, x0, x1), fy = axis(v, height, y0, y1);
     const unsigned short* const first = tx + 8ll * rec[2];
     const long long a = (long long)padded * (y0 * width + x0), b = (long long)padded * (y0 * width + x1);
     const long long c = (long long)padded * (y1 * width + x0), d = (long long)padded * (y1 * width + x1);
@@ -86,17 +94,20 @@ for (int j = 0; j < count; ++j) {{
 bool together = {"false" if lanes == 1 else "!alone"};
 float u = 0.0f, v = 0.0f, s = 0.0f, d[3] = {{}};
 float low[2] = {{3.4e38f, 3.4e38f}}, high[2] = {{-3.4e38f, -3.4e38f}};
+for (int j = 0; j < count; ++j) for (int c = 0; c < 2; ++c) {{
+    const float a = finite(place.data[c * {lanes} + active.data[j]]);
+    low[c] = a < low[c] ? a : low[c]; high[c] = a > high[c] ? a : high[c];
+}}
 for (int j = 0; j < count; ++j) {{
     const int l = active.data[j];
     const float part = 1.0f / (float)count;
-    for (int c = 0; c < 2; ++c) {{
-        const float a = finite(place.data[c * {lanes} + l]);
-        low[c] = a < low[c] ? a : low[c]; high[c] = a > high[c] ? a : high[c];
-        (c ? v : u) += a * part;
-    }}
+    // The mean counts from the least one, whose whole part is dropped: as precise far from 0 as near to it.
+    for (int c = 0; c < 2; ++c) (c ? v : u) += (finite(place.data[c * {lanes} + l]) - low[c]) * part;
     s += place.data[{2 * lanes} + l] * part;
     for (int c = 0; c < 3; ++c) d[c] += wo.data[c * {lanes} + l];
 }}
+u += low[0] - rintf(low[0]);
+v += low[1] - rintf(low[1]);
 int level = level_of(s);
 for (int c = 0; c < 2; ++c) if ((high[c] - low[c]) * (float)lv[1 + {LEVEL} * level + c] > {SEAM}f) together = false;
 head[0] = together;

@@ -53,11 +53,20 @@ for (int q = 0; q < {quads}; q += 8) {{
             x[k] = a - a == 0.0f ? a : zero;
             low[k] = wanted > 0.0f ? x[k] : zero + 3.4e38f;
             high[k] = wanted > 0.0f ? -x[k] : zero + 3.4e38f;
-            x[k] = wanted > 0.0f ? x[k] : zero;
         }}
-        *(V8*)(mean[c] + q) = fold(x[0], x[1], x[2], x[3], plus) * part;
-        *(V8*)(width[c] + q) = -fold(high[0], high[1], high[2], high[3], least)
-                             - fold(low[0], low[1], low[2], low[3], least);
+        // The mean counts from the least one, whose whole part is dropped: so it is as precise far from 0 as near to it.
+        const V8 least_of_quad = fold(low[0], low[1], low[2], low[3], least);
+        _Pragma("clang loop unroll(full)")
+        for (int k = 0; k < 4; ++k) {{
+            const V8 from = k == 0 ? __builtin_shufflevector(least_of_quad, least_of_quad, 0, 0, 0, 0, 1, 1, 1, 1)
+                          : k == 1 ? __builtin_shufflevector(least_of_quad, least_of_quad, 2, 2, 2, 2, 3, 3, 3, 3)
+                          : k == 2 ? __builtin_shufflevector(least_of_quad, least_of_quad, 4, 4, 4, 4, 5, 5, 5, 5)
+                                   : __builtin_shufflevector(least_of_quad, least_of_quad, 6, 6, 6, 6, 7, 7, 7, 7);
+            x[k] = *(const V8*)(m + 8 * k) > 0.0f ? x[k] - from : (V8){{}};
+        }}
+        *(V8*)(mean[c] + q) = least_of_quad - __builtin_elementwise_rint(least_of_quad)
+                            + fold(x[0], x[1], x[2], x[3], plus) * part;
+        *(V8*)(width[c] + q) = -fold(high[0], high[1], high[2], high[3], least) - least_of_quad;
     }}
 }}
 int split = 0;

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import torch
 from torch import nn
@@ -9,6 +11,7 @@ from torch import nn
 from warp_neumat.io.mipmaps import mip_sizes
 from warp_neumat.kernels import dispatch
 from warp_neumat.kernels.btf_train import QUADS, StepShape
+from warp_neumat.models import btf_blocks
 from warp_neumat.models.btf_config import BTFConfig, configure, from_header
 from warp_neumat.ops.btf import EXPORT, FORWARD, TRAIN, BTFStep
 
@@ -18,6 +21,9 @@ DATA = "btf"
 VERSION = 1
 DEFAULT_STEPS = 12000
 ACTIVATIONS = {"relu": torch.relu, "hardswish": nn.functional.hardswish}
+ADAPTING = 0.2
+"""Share of the steps in which the networks adapt to features that have become blocks."""
+
 CORNERS = ((-0.5, -0.5), (0.5, -0.5), (-0.5, 0.5), (0.5, 0.5))
 """The four places of a quad, in units of their distance: upper left, upper right, lower left, lower right."""
 
@@ -38,15 +44,16 @@ class BTF(nn.Module):
     def __init__(self, config: BTFConfig, seed: int = 0, scale: float = 1.0, teacher: BTF | None = None):
         super().__init__()
         self.config, self.scale = config, float(scale)
-        self.shape = StepShape(
-            config.angles, config.channels, config.hidden, config.coarse_channels, config.coarse, config.activation
-        )
+        self.shape = step_shape(config)
         generator = torch.Generator().manual_seed(seed)
         self.levels = _levels(config)
         words = sum(w * h * c for (_, w, h), c in zip(self.levels, self._level_channels(), strict=True))
         self.texels = nn.Parameter(torch.randn(words, generator=generator) * 0.1)
         self.net = nn.Parameter(self._initial_net(generator))
         self.register_buffer("history", torch.full((config.epochs,), torch.nan))
+        if config.features == "bc6h":  # what was encoded is kept, because encoding it again need not give the same
+            sizes = [16 * rows * columns * count for rows, columns, count in self._block_grids()]
+            self.register_buffer("blocks", torch.zeros(sum(sizes), dtype=torch.uint8))
         self._teacher = [teacher]  # in a list, so that its weights are no part of this module
         if teacher is not None:
             rows, width1, width2 = self.shape.hints
@@ -242,30 +249,38 @@ class BTF(nn.Module):
         return total
 
     def stages(self) -> list[dict]:
-        """Return the one stage there is."""
+        """Return the one stage there is; where features become blocks, a second one for the networks to adapt."""
         config = self.config
-        return [
-            {
-                "name": "student" if self._teacher[0] is not None else config.variant, "share": 1.0, "lr": config.lr,
-                "events": config.epochs, "until": 1.0, "schedule": config.schedule, "same_events": True,
-                "adam": {"betas": (0.9, 0.999), "eps": 1e-8},
-            }
-        ]  # fmt: skip
+        adam = {"betas": (0.9, 0.999), "eps": 1e-8}
+        first = {
+            "name": "student" if self._teacher[0] is not None else config.variant, "kind": "all", "share": 1.0,
+            "lr": config.lr, "events": config.epochs, "until": 1.0, "schedule": config.schedule, "same_events": True,
+            "adam": adam,
+        }  # fmt: skip
+        if config.features != "bc6h":
+            return [first]
+        rates = (max(config.lr[0] / 4, config.lr[1]), config.lr[1])
+        last = {"name": "blocks", "kind": "blocks", "share": ADAPTING, "lr": rates, "events": 0, "adam": adam}
+        return [{**first, "share": 1.0 - ADAPTING}, last]
 
     def trainable(self, stage: dict) -> list[nn.Parameter]:
-        """Return all parameters."""
-        return list(self.parameters())
+        """Return all parameters, without the features once they are blocks."""
+        return [p for p in self.parameters() if p is not self.texels or stage["kind"] == "all"]
 
     def rates(self, parameters) -> list[float]:
-        """Return the learning rate of each parameter in units of the stage's."""
-        return [1.0 if p is self.texels else 1.0 for p in parameters]
+        """Return the learning rate of each parameter in units of the stage's: one for all."""
+        return [1.0] * len(parameters)
 
     def event_samples(self) -> int:
         """Return the quads of the test error."""
         return 8192
 
     def begin(self, stage: dict, batches, loss, generator: torch.Generator) -> None:
-        """Nothing to prepare."""
+        """Encode the features where they are to be blocks, and go on with what is read from those."""
+        if stage["kind"] == "blocks":
+            encoded = self._encoded()
+            self.blocks.copy_(torch.from_numpy(np.concatenate([b.ravel() for blocks in encoded for b in blocks])))
+            self._decode(encoded)
 
     def enter(self, stage: dict) -> None:
         """Nothing to switch."""
@@ -284,13 +299,50 @@ class BTF(nn.Module):
 
     # --- assets ---
 
+    def folded(self) -> BTF:
+        """Return the same function with no more features than a first layer has units; this model, if that is so.
+
+        A first layer sees features only through their product with its weights, which is as good a texture and commutes
+        with filtering: of 16 features, 8 units make 8. What training had room with need not be stored nor fetched.
+        """
+        config, (first, _) = self.config, self.layers()[0]
+        fine = self.layers()[len(config.coarse)][0]
+        spare = {"channels": (config.channels, fine), "coarse_channels": (config.coarse_channels, first)}
+        spare = {name: weight for name, (count, weight) in spare.items() if count > len(weight)}
+        if not spare:
+            return self
+        less = {name: len(weight) for name, weight in spare.items()}
+        other = BTF(dataclasses.replace(config, **less), scale=self.scale)
+        with torch.no_grad():
+            for mine, its in zip(self.layers(), other.layers(), strict=True):
+                its[1].copy_(mine[1])
+                if its[0].shape == mine[0].shape:
+                    its[0].copy_(mine[0])
+            for number, (mine, its) in enumerate(zip(self.mips(), other.mips(), strict=True)):
+                name, place = ("channels", len(config.coarse)) if number < config.mips else ("coarse_channels", 0)
+                if name not in spare:
+                    its[...] = mine
+                    continue
+                before, after = self.layers()[place][0], other.layers()[place][0]
+                head = before.shape[1] - mine.shape[2]
+                its[...] = mine @ before[:, head:].T.numpy()
+                after[:, :head] = before[:, :head]
+                after[:, head:] = torch.eye(len(before))
+        return other
+
     def to_asset(self) -> tuple[dict[str, np.ndarray], dict]:
-        """Return (tensors, header) as ``kernels/btf.py`` reads them, float16."""
-        tensors = {}
+        """Return (tensors, header) of the :meth:`folded` model as ``kernels/btf.py`` reads them, float16."""
+        if self.config.features == "half" and self.folded() is not self:
+            return self.folded().to_asset()
+        tensors, kept = {}, self._kept() if self.config.features == "bc6h" else []
         with torch.no_grad():
             for number, mip in enumerate(self.mips()):
-                name = "fine" if number < self.config.mips else "coarse"
-                tensors[f"{name}.mip{number % self.config.mips}"] = mip.astype(np.float16)
+                name, level = ("fine" if number < self.config.mips else "coarse"), number % self.config.mips
+                if self.config.features == "half":
+                    tensors[f"{name}.mip{level}"] = mip.astype(np.float16)
+                else:
+                    for t, blocks in enumerate(kept[number]):
+                        tensors[f"{name}.block{t}.mip{level}"] = blocks
             deep = len(self.config.coarse)
             for number, (weight, bias) in enumerate(self.layers()):
                 name, place = ("coarse", number) if number < deep else ("fine", number - deep)
@@ -307,6 +359,35 @@ class BTF(nn.Module):
             for (at, w, h), c in zip(self.levels, self._level_channels(), strict=True)
         ]
 
+    def _encoded(self) -> list[list[np.ndarray]]:
+        """Return the blocks of every mip."""
+        return [btf_blocks.encode(mip) for mip in self.mips()]
+
+    def _block_grids(self) -> list[tuple[int, int, int]]:
+        """Return (rows, columns, textures of three channels) of every mip."""
+        shapes = [mip.shape for mip in self.mips()]
+        return [(-(-height // 4), -(-width // 4), -(-channels // 3)) for height, width, channels in shapes]
+
+    def _kept(self) -> list[list[np.ndarray]]:
+        """Return the blocks of every mip as they were encoded once."""
+        flat, at, found = self.blocks.cpu().numpy(), 0, []
+        for rows, columns, count in self._block_grids():
+            found.append([])
+            for _ in range(count):
+                size = rows * columns * 16
+                found[-1].append(flat[at : at + size].reshape(rows, columns, 16).copy())
+                at += size
+        return found
+
+    def _decode(self, encoded: list[list[np.ndarray]]) -> None:
+        """Replace the features by what a texture unit reads from blocks."""
+        with torch.no_grad():
+            read = [
+                btf_blocks.decode(blocks, mip.shape[1], mip.shape[0], mip.shape[2]).ravel()
+                for blocks, mip in zip(encoded, self.mips(), strict=True)
+            ]
+            self.texels.copy_(torch.from_numpy(np.concatenate(read).astype(np.float32)))
+
     def statistics(self) -> dict:
         """Return training facts for the header."""
         history = [round(float(v), 6) for v in self.history if torch.isfinite(v)]
@@ -315,6 +396,13 @@ class BTF(nn.Module):
         if self._teacher[0] is not None:
             facts["distillation"] = {"sigma": config.sigma, "lambda1": config.lambda1, "lambda2": config.lambda2}
         return facts
+
+
+def step_shape(config: BTFConfig) -> StepShape:
+    """Return what the fused step is compiled for."""
+    return StepShape(
+        config.angles, config.channels, config.hidden, config.coarse_channels, config.coarse, config.activation
+    )
 
 
 def _levels(config: BTFConfig) -> list[tuple[int, int, int]]:
@@ -339,9 +427,16 @@ def from_asset(tensors: dict[str, np.ndarray], config: dict) -> BTF:
     """Return a stored model."""
     model = BTF(from_header(config))
     with torch.no_grad():
+        encoded = []
         for number, mip in enumerate(model.mips()):
-            name = "fine" if number < model.config.mips else "coarse"
-            mip[...] = tensors[f"{name}.mip{number % model.config.mips}"]  # a view of the parameter
+            name, level = ("fine" if number < model.config.mips else "coarse"), number % model.config.mips
+            if model.config.features == "half":
+                mip[...] = tensors[f"{name}.mip{level}"]  # a view of the parameter
+            else:
+                encoded.append([tensors[f"{name}.block{t}.mip{level}"] for t in range(-(-mip.shape[2] // 3))])
+        if encoded:
+            model.blocks.copy_(torch.from_numpy(np.concatenate([b.ravel() for blocks in encoded for b in blocks])))
+            model._decode(encoded)
         deep = len(model.config.coarse)
         for number, (weight, bias) in enumerate(model.layers()):
             name, place = ("coarse", number) if number < deep else ("fine", number - deep)

@@ -7,6 +7,7 @@ import difflib
 
 from warp_neumat.io.block_formats import mip_limit
 
+_WIDEST = 256
 VARIANTS = {
     "coarse-to-fine": {},
     "single-level": {"channels": 30, "hidden": (8,) * 7, "coarse_channels": 0, "coarse": ()},
@@ -21,10 +22,12 @@ are a layer 23→25, four 25→25 and 25→3 in half precision."""
 ALONE = ("neumip", "neumip-max", "teacher")
 """Variants that are trained without a teacher by default."""
 
+RATES = ((16, (1.6e-2, 1e-4)), (64, (8e-3, 8e-5)), (_WIDEST, (4e-3, 4e-5)))
+"""Learning rates that reach the lowest error in some ten thousand steps, by the widest layer."""
+
 FEATURES = ("half", "bc6h")
 ACTIVATIONS = ("relu", "hardswish")
 SCHEDULES = ("cosine", "plateau")
-_WIDEST = 256
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,14 +63,14 @@ class BTFConfig:
     """Widths of the teacher's hidden layers where it is trained here."""
     teacher_steps: int = 0
     """Its steps; 0 = half of the student's."""
-    sigma: float = 0.1
-    """Weight of the teacher's outputs in the loss (Eq. 5)."""
-    lambda1: float = 0.1
-    """Weight of the latents (Eq. 5)."""
-    lambda2: float = 0.1
-    """Weight of the last hidden layer (Eq. 5)."""
-    lr: tuple[float, float] = (4e-3, 4e-5)
-    """First and last learning rate. Paper: 5e-4, 1e-7."""
+    sigma: float = 1.0
+    """Weight of the teacher's outputs in the loss (Eq. 5). Paper: 0.1."""
+    lambda1: float = 0.01
+    """Weight of the latents (Eq. 5). Paper: 0.1."""
+    lambda2: float = 0.01
+    """Weight of the last hidden layer (Eq. 5). Paper: 0.1."""
+    lr: tuple[float, float] | None = None
+    """First and last learning rate; None: by the widest layer (:data:`RATES`). Paper: 5e-4, 1e-7."""
     schedule: str = "cosine"
     """``"cosine"``; or ``"plateau"``, the paper's: halved where the test error falls by less than 1e-4 in an epoch."""
     epochs: int = 20
@@ -77,9 +80,11 @@ class BTFConfig:
         for name in ("hidden", "coarse", "teacher_hidden"):
             value = getattr(self, name)
             value = tuple(value) if isinstance(value, (tuple, list)) else (value,)
-            least = 0 if name == "coarse" else 1
-            if not least <= len(value) <= 8 or not all(_is_whole(w) and 1 <= w <= _WIDEST for w in value):
-                raise ValueError(f"{name} must be {least} to 8 widths from 1 to {_WIDEST}, as 8,8,8, got {value}")
+            good = 1 <= len(value) <= 8 and all(_is_whole(w) and 1 <= w <= _WIDEST for w in value)
+            if name == "coarse" and len(value) == 1:
+                raise ValueError(f"coarse must be hidden widths and that of the latents, as 8,8,8,8, got {value}")
+            if not good and not (name == "coarse" and not value):
+                raise ValueError(f"{name} must be 1 to 8 widths from 1 to {_WIDEST}, as 8,8,8, got {value}")
             object.__setattr__(self, name, value)
         if bool(self.coarse) != bool(self.coarse_channels):
             raise ValueError(
@@ -101,10 +106,17 @@ class BTFConfig:
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 <= value < 1e6:
                 raise ValueError(f"{name} must be a number of at least 0, got {value!r}")
-        rates = tuple(self.lr) if isinstance(self.lr, (tuple, list)) else (self.lr, self.lr / 100)
-        if len(rates) != 2 or not 0 < rates[1] <= rates[0] <= 1:
+        if self.lr is None:
+            widest = max(*self.hidden, *self.coarse, 1)
+            object.__setattr__(self, "lr", next(rates for most, rates in RATES if widest <= most))
+        rates = tuple(self.lr) if isinstance(self.lr, (tuple, list)) else (self.lr,)
+        good = all(isinstance(rate, (int, float)) and not isinstance(rate, bool) for rate in rates)
+        rates = (*rates, rates[0] / 100) if good and len(rates) == 1 else rates
+        if not good or len(rates) != 2 or not 0 < rates[1] <= rates[0] <= 1:
             raise ValueError(f"lr must be the first and the last rate, as 4e-3,4e-5, got {self.lr!r}")
         object.__setattr__(self, "lr", rates)
+        if not isinstance(self.teacher, str) or not self.teacher:
+            raise ValueError(f"teacher must be auto, none or the file of a fitted btf, got {self.teacher!r}")
         for name, allowed in (
             ("variant", tuple(VARIANTS)),
             ("features", FEATURES),
@@ -150,6 +162,8 @@ def configure(source, options: dict) -> BTFConfig:
     """
     fields = [field.name for field in dataclasses.fields(BTFConfig)]
     for key in options:
+        if key in ("width", "height"):
+            raise ValueError(f"{key} is the source's, {source.width}×{source.height}; fit a source of another size")
         if key not in fields:
             close = difflib.get_close_matches(key, fields, n=1, cutoff=0.0)[0]
             raise ValueError(f"btf has no option {key!r}; nearest: {close}; known: {', '.join(fields)}")

@@ -17,7 +17,7 @@ from warp_neumat.io.asset import FormatError, read_asset, write_asset
 from warp_neumat.io.btf_source import BTFSource
 from warp_neumat.io.cache import cache_folder
 from warp_neumat.materials.btf import BTF
-from warp_neumat.models.btf import CORNERS
+from warp_neumat.models.btf import CORNERS, step_shape
 from warp_neumat.models.btf_config import VARIANTS, BTFConfig
 from warp_neumat.simulation.open_btf import open_btf
 from warp_neumat.training.btf_slices import SliceSampler
@@ -164,10 +164,13 @@ class Distillation:
     def resume(self) -> bool:
         """Go on from the checkpoint, if there is one, when :meth:`run` comes to it. The teacher has one of its own."""
         self._resume = True
-        return Path(self.checkpoint).is_file() or self._teacher_checkpoint().is_file() or self._cached().is_file()
+        trains = self.shape.distilled and self.shape.teacher == "auto"
+        teacher = trains and (self._teacher_checkpoint().is_file() or self._cached().is_file())
+        return teacher or Path(self.checkpoint).is_file()
 
     def run(self) -> dict:
-        """Train; return the training facts of the model, and ``teacher``: its file, test error and seconds."""
+        """Train; return the training facts of the model, and of its teacher ``teacher``, its file and error, and
+        ``teacher_seconds``, how long it took, None where it was at hand."""
         self.scale = mean_value(self.source)
         taught, facts, share = None, {}, 0.0
         if self.shape.distilled:
@@ -181,13 +184,13 @@ class Distillation:
         if self._resume:
             self._trainer.resume()
         found = self._trainer.run()
-        return {**found, "teacher": facts["teacher"]} if facts else found
+        return {**found, "teacher": facts["teacher"], "teacher_seconds": facts["seconds"]} if facts else found
 
     # --- the teacher ---
 
     def _teacher_config(self) -> BTFConfig:
         shape = {"variant": "teacher", **VARIANTS["teacher"], "hidden": self.shape.teacher_hidden, "teacher": "none"}
-        kept = ("width", "height", "mips", "half_vector", "lr", "schedule", "epochs")
+        kept = ("width", "height", "mips", "half_vector", "schedule", "epochs")
         return BTFConfig(**{name: getattr(self.shape, name) for name in kept}, **shape)
 
     def _teacher_plan(self):
@@ -199,7 +202,14 @@ class Distillation:
         plan = dataclasses.asdict(self._teacher_plan())
         del plan["checkpoint_seconds"]
         source = {name: self.identity.get(name) for name in ("source", "opening")}
-        return {"config": repr(self._teacher_config()), "plan": plan, "version": self.module.VERSION, **source}
+        data = hashlib.sha256(self.source.slices(np.zeros((1, 2), np.int64)).tobytes()).hexdigest()
+        return {
+            "config": repr(self._teacher_config()),
+            "plan": plan,
+            "version": self.module.VERSION,
+            "data": data,
+            **source,
+        }
 
     def _cached(self) -> Path:
         if self.shape.teacher not in ("auto", "none"):
@@ -216,12 +226,9 @@ class Distillation:
         given = self.shape.teacher != "auto"
         if given or path.is_file():
             try:
-                tensors, header = read_asset(path)
-                if header["kind"] != "btf":
-                    raise FormatError(path, "kind", f"a teacher must be of kind btf, got {header['kind']}", "fit one")
-                model = self.module.from_asset(tensors, header["config"]).to(self.device)
-                _check_mips(path, model.config, self.shape)
-                return model, {"teacher": {"file": path.name, "l1": header["metrics"]["l1"], "cached": True}}
+                model, header = self._read_teacher(path)
+                l1 = header.get("metrics", {}).get("l1")
+                return model, {"teacher": {"file": path.name, "l1": l1}, "seconds": None}
             except FormatError:
                 if given:
                     raise  # one of ours that is damaged is made again
@@ -244,23 +251,26 @@ class Distillation:
         write_asset(path, tensors, header)
         self._teacher_checkpoint().unlink(missing_ok=True)
         model = self.module.from_asset(tensors, header["config"]).to(self.device)  # as one out of the cache
-        found = {"file": path.name, "l1": metrics["l1"], "cached": False, "seconds": seconds}
-        return model, {"teacher": found, "share": share}
+        return model, {"teacher": {"file": path.name, "l1": metrics["l1"]}, "seconds": seconds, "share": share}
+
+    def _read_teacher(self, path: Path) -> tuple:
+        """Return (model, header) of a teacher's file.
+
+        Raises:
+            FormatError: If it is none, or one of a texture of another size or of fewer mips.
+        """
+        tensors, header = read_asset(path)
+        if header["kind"] != "btf":
+            raise FormatError(path, "kind", f"a teacher must be of kind btf, got {header['kind']}", "fit one")
+        BTF(tensors, header, path=path, device="cpu")  # checks all of it
+        model, student = self.module.from_asset(tensors, header["config"]).to(self.device), self.shape
+        size, wanted = ((c.width, c.height, c.mips) for c in (model.config, student))
+        if size[:2] != wanted[:2] or size[2] < wanted[2]:
+            rule = "a teacher must be {}×{} with {} mips, as what it teaches, got {}×{} with {}".format(*wanted, *size)
+            raise FormatError(path, "config", rule, "fit one to this source")
+        return model, header
 
 
 def _cost(config: BTFConfig) -> float:
     """Return what a training step costs, in multiply-adds and in units of a batch, roughly."""
-    from warp_neumat.kernels.btf_train import StepShape
-
-    shape = StepShape(
-        config.angles, config.channels, config.hidden, config.coarse_channels, config.coarse, config.activation
-    )
-    return 3.0 * shape.products + 2e4
-
-
-def _check_mips(path, teacher: BTFConfig, student: BTFConfig) -> None:
-    if teacher.mips < student.mips:
-        raise FormatError(
-            path, "mips", f"a teacher must have the student's {student.mips} mips, got {teacher.mips}",
-            f"fit with mips={teacher.mips}",
-        )  # fmt: skip
+    return 3.0 * step_shape(config).products + 2e4

@@ -96,8 +96,12 @@ class SliceSampler:
         for number, (w, h) in enumerate(self.sizes):
             mine = np.flatnonzero(level == number)
             columns, rows = max(1, w // 2), max(1, h // 2)
+            if self.aligned:  # texel centres, where a side is odd too
+                x, y = rng.integers(0, columns, len(mine)), rng.integers(0, rows, len(mine))
+                place[mine, 0], place[mine, 1] = (2 * x + 1) / w, (2 * y + 1) / h
+                continue
             cell = rng.permutation(columns * rows)[np.arange(len(mine)) % (columns * rows)]
-            jitter = 0.5 if self.aligned else rng.random((2, len(mine)))
+            jitter = rng.random((2, len(mine)))
             place[mine, :2] = (np.stack([cell % columns, cell // columns]) + jitter).T / (columns, rows)
         return place
 

@@ -236,7 +236,7 @@ def fit(
 ) -> dict:
     """Fit ``model`` to ``source``, write the asset to ``out``, and return its header and how long it took.
 
-    The returned ``header["training"]["seconds"]`` is not in the file.
+    The returned ``header["training"]["seconds"]``, and ``"teacher_seconds"`` of a teacher, are not in the file.
 
     Args:
         source: As for :func:`warp_neumat.io.brdf.open_brdf`, or for model ``bcf`` as for
@@ -294,12 +294,13 @@ def fit(
             header["source"]["notes"] = notes
         if settled:
             header["source"]["opening"] = settled
-        seconds = facts.pop("seconds")  # returned, but not stored: the same seed gives the same file
+        # Returned, but not stored: the same seed gives the same file.
+        spent = {name: facts.pop(name) for name in ("seconds", "teacher_seconds") if name in facts}
         header["training"] = {**facts, **trainer.model.statistics()}
         header["metrics"] = {**metrics, "bytes": metrics.get("bytes", size)}
         if tensors:  # what is fitted for comparison alone has no file
             write_asset(out, tensors, header)
-        header["training"]["seconds"] = seconds
+        header["training"] |= spent
     checkpoint_path(out).unlink(missing_ok=True)
     if progress:
         progress(1.0, f"wrote {out}" if tensors else "measured; for comparison alone, so nothing is written")

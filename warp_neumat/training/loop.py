@@ -233,7 +233,7 @@ class Trainer:
         tensors = {f"model.{name}": value for name, value in self.model.state_dict().items()}
         tensors |= checkpoint.optimiser_tensors(optimiser, parameters)
         state = {"stage": self._stage, "step": self._step, "event": self._event, "elapsed": self._elapsed}
-        state["plateau"] = self._plateau
+        state |= {"plateau": self._plateau, "loss": self.last_loss if math.isfinite(self.last_loss) else None}
         checkpoint.save(self.checkpoint, tensors, state, self._facts())
 
     def resume(self) -> bool:
@@ -249,5 +249,6 @@ class Trainer:
         self.model.load_state_dict(model)
         self._stage, self._step, self._event = state["stage"], state["step"], state["event"]
         self._elapsed, self._plateau = state["elapsed"], state["plateau"]
+        self.last_loss = math.nan if state["loss"] is None else state["loss"]
         self._pending = {name: value for name, value in tensors.items() if name.startswith("optimiser.")}
         return True
