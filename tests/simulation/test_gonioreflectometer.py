@@ -183,10 +183,11 @@ def test_it_is_a_source():
     [
         ("weav", "no pattern 'weav'; nearest: weave"),
         ("weave?thread=4", "weave has no parameter 'thread'; nearest: threads"),
-        ("weave?relief=9", r"relief must be a number in \[0.0, 2.0\], got 9.0"),
+        ("weave?relief=9", r"relief must be a number in \[0.0, 2.0\], got 9"),
         ("weave?threads=5", "threads must be a multiple of 2"),
         ("weave?threads=6&twill=1", "threads must be a multiple of 4 for twill"),
         ("leather?color=1,2", r"color must be R,G,B in \[0.0, 1.0\]"),
+        ("leather?size=8", r"size must be a whole number in \[16, 1024\], got 8$"),
         ("leather?size=many", "size must be a number or R,G,B, got 'many'"),
         ("wood?size=16&size=32", "'size' must be given once"),
         ("wood?samples=5", "samples must be 4 or 16, got 5"),

@@ -8,7 +8,7 @@ that rows are full. A row or group is a matrix [feature][ROW], and a layer a few
 Every generator writes for a register of ``vector`` floats; :func:`~.neubrdf_code.by_width` picks it.
 """
 
-from warp_neumat.kernels.mlp import _split
+from warp_neumat.kernels.mlp import split_outputs
 
 ROW = 16
 """Lanes of a row: two registers of AVX, one of AVX-512."""
@@ -81,7 +81,7 @@ def layer(inputs: int, outputs: int, weights: str, source: str, target: str, vec
     """
     registers = ROW // vector
     text = ["{"]
-    for first, size, count in _split(outputs, MOST[vector]):
+    for first, size, count in split_outputs(outputs, MOST[vector]):
         cells = [(b, u) for b in range(size) for u in range(registers)]
         text.append(f"for (int block = 0; block < {count}; ++block) {{ const int o = {first} + block * {size};")
         for b, u in cells:

@@ -54,7 +54,7 @@ for (int q = 0; q < {quads}; q += 8) {{
             low[k] = wanted > 0.0f ? x[k] : zero + 3.4e38f;
             high[k] = wanted > 0.0f ? -x[k] : zero + 3.4e38f;
         }}
-        // The mean counts from the least one, whose whole part is dropped: so it is as precise far from 0 as near to it.
+        // The mean counts from the least, whose whole part is dropped: as precise far from 0 as near to it.
         const V8 least_of_quad = fold(low[0], low[1], low[2], low[3], least);
         _Pragma("clang loop unroll(full)")
         for (int k = 0; k < 4; ++k) {{

@@ -85,9 +85,12 @@ def pack(weights, biases) -> np.ndarray:
     return np.concatenate(parts)
 
 
-def _split(outputs: int, most: int) -> list[tuple[int, int, int]]:
-    """Split ``outputs`` into runs (start, size, count) of blocks of at most ``most``: as even as possible, because a
-    block of one or two outputs has too few independent sums to hide the latency of a fused multiply-add."""
+def split_outputs(outputs: int, most: int) -> list[tuple[int, int, int]]:
+    """Return runs (start, size, count) of blocks of at most ``most`` that together are ``outputs``.
+
+    Blocks are as even as possible: one of one or two outputs has too few independent sums to hide the latency of a
+    fused multiply-add.
+    """
     count = -(-outputs // most)
     small, extra = divmod(outputs, count)
     runs = []
@@ -102,7 +105,7 @@ def layer_code(inputs, outputs, *, source, stride, target, target_stride, offset
     """C++ for one layer over one tile of ``vectors`` vectors of lanes."""
     text = []
     bias, weight = offset, offset + outputs
-    for start, size, count in _split(outputs, most):
+    for start, size, count in split_outputs(outputs, most):
         cells = [(b, u) for b in range(size) for u in range(vectors)]
         text.append(f"for (int r = 0; r < {count}; ++r) {{ const int o = {start} + r * {size};")
         text += [f"V a{b}_{u} = {{}}; a{b}_{u} += w[{bias} + o + {b}];" for b, u in cells]

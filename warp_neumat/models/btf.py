@@ -188,7 +188,10 @@ class BTF(nn.Module):
 
     # --- what training.loop relies on ---
 
-    step_threads = None
+    @property
+    def step_threads(self) -> int | None:
+        """Threads of torch in a step: beside the fused pass one, where its arrays are too small to share."""
+        return 1 if self.net.device.type == "cpu" and self.texels.numel() < 1 << 20 else None
 
     def prepare(self, samples: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
         """Return the batch that :meth:`gradients` takes, of ``wi``, ``wo``, ``place`` and ``value`` (n, 12)."""
@@ -278,6 +281,8 @@ class BTF(nn.Module):
     def begin(self, stage: dict, batches, loss, generator: torch.Generator) -> None:
         """Encode the features where they are to be blocks, and go on with what is read from those."""
         if stage["kind"] == "blocks":
+            self._fold()
+            self._turn()
             encoded = self._encoded()
             self.blocks.copy_(torch.from_numpy(np.concatenate([b.ravel() for blocks in encoded for b in blocks])))
             self._decode(encoded)
@@ -330,6 +335,40 @@ class BTF(nn.Module):
                 after[:, head:] = torch.eye(len(before))
         return other
 
+    def _fold(self) -> None:
+        """Become the :meth:`folded` model."""
+        other = self.folded()
+        if other is not self:
+            self.config, self.shape, self.levels = other.config, other.shape, other.levels
+            device = self.net.device
+            self.texels, self.net = nn.Parameter(other.texels.data.to(device)), nn.Parameter(other.net.data.to(device))
+            self._steps = {}
+
+    def _turn(self) -> None:
+        """Turn features to principal components, which the first layers undo, one of the strongest in each three.
+
+        The texels of a block lie on a line or two in their three channels: so little is lost where one component is
+        large and the others are small.
+        """
+        deep = len(self.config.coarse)
+        with torch.no_grad():
+            for place, mips in ((deep, self.mips()[: self.config.mips]), (0, self.mips()[self.config.mips :])):
+                if not mips:
+                    continue
+                rows = np.concatenate([mip.reshape(-1, mip.shape[2]) for mip in mips]).astype(np.float64)
+                _, axes = np.linalg.eigh(np.cov(rows.T).reshape(rows.shape[1], -1))
+                axes = np.ascontiguousarray(axes.T[btf_blocks.by_threes(rows.shape[1])], np.float32)  # weakest first
+                weight = self.layers()[place][0]
+                weight[:, -len(axes) :] = weight[:, -len(axes) :] @ torch.from_numpy(axes.T.copy()).to(weight)
+                for mip in mips:
+                    mip[...] = mip @ axes.T
+
+    def load_state_dict(self, state, *args, **kwargs):
+        """Take over a state, of this model or of what became of it when its features were to be blocks."""
+        if state["texels"].shape != self.texels.shape:
+            self._fold()
+        return super().load_state_dict(state, *args, **kwargs)
+
     def to_asset(self) -> tuple[dict[str, np.ndarray], dict]:
         """Return (tensors, header) of the :meth:`folded` model as ``kernels/btf.py`` reads them, float16."""
         if self.config.features == "half" and self.folded() is not self:
@@ -364,9 +403,12 @@ class BTF(nn.Module):
         return [btf_blocks.encode(mip) for mip in self.mips()]
 
     def _block_grids(self) -> list[tuple[int, int, int]]:
-        """Return (rows, columns, textures of three channels) of every mip."""
-        shapes = [mip.shape for mip in self.mips()]
-        return [(-(-height // 4), -(-width // 4), -(-channels // 3)) for height, width, channels in shapes]
+        """Return (rows, columns, textures of three channels) of every mip of the folded model."""
+        config = self.config
+        fine = min(config.channels, config.hidden[0])
+        coarse = min(config.coarse_channels, config.coarse[0]) if config.coarse else 0
+        counts = [fine] * config.mips + [coarse] * (len(self.levels) - config.mips)
+        return [(-(-h // 4), -(-w // 4), -(-c // 3)) for (_, w, h), c in zip(self.levels, counts, strict=True)]
 
     def _kept(self) -> list[list[np.ndarray]]:
         """Return the blocks of every mip as they were encoded once."""

@@ -9,7 +9,16 @@ import numpy as np
 
 from warp_neumat.io.block_formats import from_blocks, to_blocks
 from warp_neumat.kernels.bc6h import bc6h_decode
-from warp_neumat.kernels.bc6h_encode import bc6h_encode
+from warp_neumat.kernels.bc6h_encode import bc6h_fit
+
+
+def by_threes(count: int) -> list[int]:
+    """Return an order of 0 … ``count`` − 1 in which the greatest come first in each three, the least with the first."""
+    left, found = list(range(count)), []
+    heads = [left.pop() for _ in range(-(-count // 3))]
+    for head in heads:
+        found += [head, *(left.pop(0) for _ in range(min(2, len(left))))]
+    return found
 
 
 def encode(mip: np.ndarray) -> list[np.ndarray]:
@@ -21,7 +30,8 @@ def encode(mip: np.ndarray) -> list[np.ndarray]:
     for first in range(0, channels, 3):
         texels = to_blocks(np.ascontiguousarray(padded[..., first : first + 3]))
         rows, columns = texels.shape[:2]
-        blocks = bc6h_encode(np.ascontiguousarray(texels).reshape(-1, 4, 4, 3), signed=True)
+        targets = np.ascontiguousarray(texels.astype(np.float32)).reshape(-1, 16, 3)
+        blocks, _ = bc6h_fit(targets, signed=True, linear=True)  # an error counts alike wherever it is
         found.append(blocks.reshape(rows, columns, 16))
     return found
 

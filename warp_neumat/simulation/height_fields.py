@@ -349,8 +349,14 @@ def parse_query(spec: str, query: str) -> dict:
         if not equals or key in found:
             raise ValueError(f"{spec}: parameter {key!r} must be given once, as {key}=VALUE")
         try:
-            numbers = tuple(float(t) for t in urllib.parse.unquote(text).split(","))
+            numbers = tuple(_number(t) for t in urllib.parse.unquote(text).split(","))
         except ValueError:
             raise ValueError(f"{spec}: {key} must be a number or R,G,B, got {text!r}") from None
         found[key] = numbers if len(numbers) > 1 else numbers[0]
     return found
+
+
+def _number(text: str) -> float:
+    """Return a number, whole ones as int, so that messages show them as they were written."""
+    number = float(text)
+    return int(number) if number.is_integer() else number
