@@ -13,7 +13,7 @@ import numpy as np
 
 from ._brdf_lab import _append, _read_cache
 
-TABLES = ("table1", "figure7", "figure11", "figure13", "figure10", "table3", "peers")
+TABLES = ("table1", "figure7", "figure11", "ablation", "figure13", "figure10", "table3", "peers")
 
 MATERIALS = ("weave", "leather", "carpet", "wood")
 """Micro-geometries of a run that names no material."""
@@ -26,6 +26,19 @@ NETWORKS = {
     "neumip-max": {"variant": "neumip-max"},
 }
 """Method → options of the fit."""
+
+_ALONE = {"teacher": "none"}
+ABLATION = {
+    "as it is": {},
+    "ReLU": {"activation": "relu"},
+    "no half vector": {"half_vector": False},
+    "half of the layers coarse": {"coarse": (8, 8), "hidden": (8,) * 5},
+    "most layers coarse": {"coarse": (8,) * 6, "hidden": (8,)},
+    "all mips": {"mips": 0},
+    "BC6H features": {"features": "bc6h"},
+}
+"""Row of the ablation → options of a coarse-to-fine fit without a teacher; all but the half vector's have the weights of
+the first."""
 
 LAFORTUNE = "lafortune"
 
@@ -118,6 +131,9 @@ class Lab:
 
     def _options(self, method: str) -> dict:
         given = {name: getattr(self.choice, name) for name in ("epochs", "mips")}
+        if method in ABLATION:
+            given = {name: value for name, value in given.items() if value is not None}
+            return {**_ALONE, **given, **ABLATION[method]}
         return {**NETWORKS[method], **{name: value for name, value in given.items() if value is not None}}
 
     def _network(self, material: str, method: str) -> dict:

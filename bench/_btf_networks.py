@@ -34,8 +34,14 @@ SHAPES = {
         "coarse": {"channels": 14, "hidden": [8, 8, 8], "latent": 8},
     },
     "single-level": {"fine": {"channels": 30, "hidden": [8] * 7}, "coarse": None},
+    "coarse-to-fine, folded": {
+        "fine": {"channels": 8, "hidden": [8, 8, 8]},
+        "coarse": {"channels": 8, "hidden": [8, 8, 8], "latent": 8},
+    },
+    "single-level, folded": {"fine": {"channels": 8, "hidden": [8] * 7}, "coarse": None},
 }
-"""Name → networks as an asset's config says them; both have 779 weights, and 30 features a texel."""
+"""Name → networks as an asset's config says them; the first two have the paper's 779 weights, and 30 features a texel;
+the others are what is stored of them, with no more features than a first layer has units (``BTF.folded``)."""
 
 CHECKED = 1024
 """Quads that are compared with float64."""
@@ -45,7 +51,7 @@ def asset(rng, name: str, *, side: int = SIDE, mips: int = 1) -> tuple[dict, dic
     """Return (tensors, header) of a material of one of :data:`SHAPES` with random contents, values of order one."""
     shape = SHAPES[name]
     config = {"width": side, "height": side, "mips": mips, "half_vector": True, "features": "half", **shape}
-    config["activation"] = VARIANTS[name].get("activation", BTFConfig.activation)
+    config["activation"] = VARIANTS[name.partition(",")[0]].get("activation", BTFConfig.activation)
     fine, coarse = shape["fine"], shape["coarse"]
     head = coarse["latent"] if coarse else 9
     nets = {"fine": (head + fine["channels"], *fine["hidden"], 3)}
@@ -221,8 +227,13 @@ def line(x, y) -> dict[str, float]:
 
 
 def rows(device, texels: int, rounds: int):
-    """Yield Figure 13's times: both designs under 1 … 4 lights, in turns."""
-    runs = {name: Run(name, texels, device) for name in ("coarse-to-fine", "single-level")}
+    """Yield Figure 13's times: both designs under 1 … 4 lights, in turns; then both as they are stored."""
+    for names in (("coarse-to-fine", "single-level"), ("coarse-to-fine, folded", "single-level, folded")):
+        yield from _compared(names, device, texels, rounds)
+
+
+def _compared(names, device, texels: int, rounds: int):
+    runs = {name: Run(name, texels, device) for name in names}
     calls = {(name, n): functools.partial(run.call, n) for name, run in runs.items() for n in range(1, 5)}
     seconds = least(calls, rounds)
     ours, peer = runs

@@ -8,6 +8,8 @@ fit``. ``python -m bench.btf`` takes a choice (``--help``):
   ``over_neumip``: the error over NeuMIP's; ``under_lafortune``: Lafortune's error over this one.
 - ``figure7``: test L1 over the epochs of a fit, ours beside NeuMIP; ``figure11``: ours with and without distillation.
   Epoch 0 is before the first step.
+- ``ablation``: the student without a teacher, and what it loses or gains by each choice: activation, half vector, where
+  the layers are cut in two, mips, block-compressed features.
 - ``figure13``: coarse-to-fine beside a single level of equal capacity, both distilled: error after equal steps, and
   time under 1 … 4 lights of fetches and networks alone, in turns in one process (``_btf_networks.py``).
 - ``figure10``: the texel-space shading stage over 1 … 8 lights on a sheet of 1200² texels, the line through the times,
@@ -30,7 +32,7 @@ import os
 import sys
 from pathlib import Path
 
-from ._btf_lab import LAFORTUNE, MATERIALS, METHODS, NETWORKS, TABLES, Choice, Lab
+from ._btf_lab import ABLATION, LAFORTUNE, MATERIALS, METHODS, NETWORKS, TABLES, Choice, Lab
 
 _TIMES = ("lights", "texels", "ms", "error", "peer", "peer_ms", "ratio", "peer_error")
 _STAGE = ("lights", "materials", "texels", "ms", "evaluations", "slope_ms", "r2")
@@ -39,6 +41,7 @@ SHOWN = {
     "table1": ("l1", "l1_relative", "over_neumip", "under_lafortune", "bytes", "weights", "macs", "seconds"),
     "figure7": ("epoch", "l1"),
     "figure11": ("epoch", "l1"),
+    "ablation": ("l1", "over_first", "bytes", "weights", "macs", "seconds"),
     "figure13": ("l1", "weights", "macs", *_TIMES),
     "figure10": (*_STAGE, "peer", "peer_ms", "ratio"),
     "table3": _STAGE,
@@ -101,6 +104,18 @@ def figure7(lab: Lab):
 def figure11(lab: Lab):
     """Yield the test errors of ours with and without distillation."""
     return _curves(lab, "figure11", ("distilled", "alone"))
+
+
+def ablation(lab: Lab):
+    """Yield the student without one of its parts after the other."""
+    for material in lab.choice.materials:
+        first = None
+        for method in ABLATION:
+            record = lab.measure(material, method)
+            first = first or record["l1"]
+            row = {"table": "ablation", "material": _short(material), "method": method}
+            shown = {name: value for name, value in record.items() if name != "test_l1"}
+            yield {**row, "over_first": record["l1"] / first, **shown}
 
 
 def figure13(lab: Lab):
