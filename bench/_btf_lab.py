@@ -37,8 +37,7 @@ ABLATION = {
     "all mips": {"mips": 0},
     "BC6H features": {"features": "bc6h"},
 }
-"""Row of the ablation → options of a coarse-to-fine fit without a teacher; all but the half vector's have the weights of
-the first."""
+"""Row of the ablation → options of a coarse-to-fine fit without a teacher, with the weights of the first but for h."""
 
 LAFORTUNE = "lafortune"
 
