@@ -147,6 +147,16 @@ def test_partly_wanted_and_partly_lit_blocks_match_float64(rng, asset, share):
         assert np.isfinite(got).all()
 
 
+def test_what_lanes_hold_that_are_not_asked_for_does_not_matter(rng, asset):
+    uv, lod, wo, wi = block_of(rng)
+    wanted = rng.random(256) < 0.7
+    lit = wanted & (rng.random((2, 256)) < 0.6)
+    expected = run_block(asset[1], uv, lod, wo, wanted, wi, lit)
+    uv[~wanted] = lod[~wanted] = wo[~wanted] = wi[~lit] = np.nan
+    got = run_block(asset[1], uv, lod, wo, wanted, wi, lit)
+    assert np.array_equal(got[lit], expected[lit])
+
+
 def test_every_lane_of_a_seam_is_evaluated_by_itself(rng, asset):
     """With all quads apart, a block holds as many items as lanes; each is what a row by itself is."""
     tensors, material = asset

@@ -71,6 +71,20 @@ def test_quads_match_float64(rng, name):
     assert (got[::50] == 0).all()
 
 
+@pytest.mark.parametrize("size", [(1, 1), (3, 2), (5, 400)])
+def test_places_on_centres_and_borders_of_texels_match_float64(rng, size):
+    """And one step of float32 beside them, periods away, where a rounded product may fall into the next texel."""
+    tensors, header = random_btf(rng, width=size[0], height=size[1], mips=1)
+    material, axes = BTF(tensors, header), []
+    for n in size:
+        on = (np.arange(-4 * n, 4 * n + 1) / (2 * n)).astype(np.float32)
+        axes.append(np.concatenate([on, np.nextafter(on, np.float32(9)), np.nextafter(on, np.float32(-9))]))
+    uv = np.stack([rng.choice(axis, 5000) for axis in axes], 1)
+    wi, wo, _ = _samples(rng, 5000, 1)
+    expected = reference.btf_rows(tensors, material.config, uv, wi, wo)
+    assert np.abs(material.eval(uv, wi, wo) - expected).max() < TOLERANCE * expected.max()
+
+
 def test_quads_of_one_place_are_rows(rng):
     """Four texels at one place see the same coarse features as a row there."""
     _, material = made("coarse-to-fine")

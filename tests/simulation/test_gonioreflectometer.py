@@ -80,6 +80,18 @@ def test_no_more_light_leaves_than_came():
     assert (share > 0.6).all(), share
 
 
+def test_light_and_view_can_be_exchanged():
+    """Of the mean over a period, which is a BRDF of the mean plane: shadows, masks and bounces included."""
+    rng = np.random.default_rng(5)
+    m = dataclasses.replace(_random(rng, 48), height=2.5 * band_noise(rng, 48, 3), roughness=np.full((48, 48), 0.5))
+    chosen = DIRECTIONS[[0, 30, 77, 110, 131, 149]]
+    source = Gonioreflectometer(m, chosen, chosen, sub=4, bounces=3, rays=64, cache=False)
+    brdf = source.slices(_all(6, 6)).mean((1, 2)).reshape(6, 6, 3) / chosen[:, None, 2:]
+    asymmetry = np.abs(brdf - brdf.swapaxes(0, 1)) / np.maximum(brdf, brdf.swapaxes(0, 1))
+    assert asymmetry.max() < 0.02, asymmetry.max()
+    assert brdf.std() > 0.1 * brdf.mean()
+
+
 def test_shadows_and_masks():
     height = np.zeros((32, 32), np.float32)
     height[:, 12:20] = 5.0

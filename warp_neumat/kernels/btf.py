@@ -258,13 +258,12 @@ def _native(layout: Layout, lanes: int) -> types.SimpleNamespace:
 
 
 @functools.cache
-def functions(layout: Layout, lanes: int, alone: bool = False) -> types.SimpleNamespace:
+def functions(layout: Layout, lanes: int) -> types.SimpleNamespace:
     """Return the Warp functions of a material; ``materials.base.Shader`` says what a textured one's take and give.
 
     Args:
         layout: What the networks look like.
         lanes: Lanes of a block: a multiple of 32 on the CPU, 1 or 4 on CUDA.
-        alone: Whether lanes are evaluated by themselves, not in quads.
 
     Error: at most 1e-5 of the largest value against float64 (worst seen 5e-6, textures to 1024² and uv to ±8); held
         by test_quads_match_float64.
@@ -272,7 +271,6 @@ def functions(layout: Layout, lanes: int, alone: bool = False) -> types.SimpleNa
     native = _native(layout, lanes)
     view_block, light_block = native.view, native.light
     WORDS = max(1, layout.scratch(lanes))
-    ALONE = int(alone)
 
     @wp.func
     def view(
@@ -288,7 +286,7 @@ def functions(layout: Layout, lanes: int, alone: bool = False) -> types.SimpleNa
         if count > 0:
             view_block(
                 material.texels, material.levels, material.weights, material.level_at, material.weight_at, place, wo,
-                active, count, ALONE, own,
+                active, count, 0, own,
             )  # fmt: skip
 
     @wp.func
@@ -317,20 +315,20 @@ def eval_scratch(layout: Layout, lanes: int) -> int:
 
 
 @functools.cache
-def make_eval_kernel(layout: Layout, lanes: int, quads: bool):
-    """Return the kernel behind ``BTF.eval`` and, with ``quads``, ``BTF.eval_quads``: values of pairs of directions.
+def make_eval_kernel(layout: Layout, lanes: int):
+    """Return the kernel behind ``BTF.eval`` and ``BTF.eval_quads``: values of pairs of directions.
 
     Args:
         layout: What the networks look like.
         lanes: Lanes of a block (:func:`eval_lanes`).
-        quads: Whether four uv share their pair of directions and their level.
 
-    ``lod_step`` is 1 where each row has a level of its own, 0 where all share one; ``count`` counts lanes.
+    ``shift`` is 2 where four uv share their pair of directions and their level, else 0; ``lod_step`` is 1 where each
+    row has a level of its own, 0 where all share one; ``count`` counts lanes.
     """
-    evaluate = functions(layout, lanes, not quads)
-    view, light = evaluate.view, evaluate.light
+    native = _native(layout, lanes)
+    view_block, light_block = native.view, native.light
     L = lanes
-    SHIFT = 2 if quads else 0
+    WORDS = max(1, layout.scratch(lanes))
     # Two names, because a constant that is cast keeps the new type in the rest of the kernel.
     TOTAL = STRIDE = eval_scratch(layout, lanes)
     FLOAT = wp.constant(wp.uint64(4))
@@ -345,6 +343,7 @@ def make_eval_kernel(layout: Layout, lanes: int, quads: bool):
         lod_step: int,
         wi: wp.array(dtype=wp.float32),
         wo: wp.array(dtype=wp.float32),
+        shift: int,
         count: int,
         scratch: wp.array(dtype=wp.float32),
         # outputs
@@ -360,12 +359,12 @@ def make_eval_kernel(layout: Layout, lanes: int, quads: bool):
         Y = wp.array(ptr=own + wp.uint64(6 * L) * FLOAT, shape=(3 * L,), dtype=wp.float32)
         Q = wp.array(ptr=own + wp.uint64(9 * L) * FLOAT, shape=(3 * L,), dtype=wp.float32)
         active = wp.array(ptr=own + wp.uint64(12 * L) * FLOAT, shape=(L,), dtype=wp.int32)
-        own = own + wp.uint64(16 * L) * FLOAT
+        rows = wp.array(ptr=own + wp.uint64(16 * L) * FLOAT, shape=(WORDS,), dtype=wp.float32)
         lit = int(0)
         rest = wp.min(count - b * L, L)
         for l in range(L):
             item = b * L + wp.min(l, rest - 1)
-            row = item >> SHIFT
+            row = item >> shift
             i = safe_normalize(wp.vec3(wi[3 * row], wi[3 * row + 1], wi[3 * row + 2]))
             o = safe_normalize(wp.vec3(wo[3 * row], wo[3 * row + 1], wo[3 * row + 2]))
             for c in range(3):
@@ -380,8 +379,11 @@ def make_eval_kernel(layout: Layout, lanes: int, quads: bool):
             active[lit] = l
             lit += wp.where(l < rest and I[2 * L + l] > 0.0 and O[2 * L + l] > 0.0, 1, 0)
         if lit > 0:
-            view(material, Q, O, active, lit, own, Y)
-            light(material, I, active, lit, own, Y)
+            view_block(
+                material.texels, material.levels, material.weights, material.level_at, material.weight_at, Q, O,
+                active, lit, wp.where(shift == 0, 1, 0), rows,
+            )  # fmt: skip
+            light_block(material.weights, material.weight_at, I, active, lit, rows, Y)
         for l in range(L):
             if l < rest:
                 above = I[2 * L + l] > 0.0 and O[2 * L + l] > 0.0

@@ -198,7 +198,7 @@ auto find = [&](const float* u, const float* v, const int* level, Taps& to) {{
             const V8 s = __builtin_convertvector(size, V8);
             V8 whole = __builtin_elementwise_floor(a * s - 0.5f);
             // The product, rounded, is as wrong as a texel is far from the middle; its remainder is not.
-#if defined(__FMA__)
+#if defined(__FMA__) || defined(__ARM_FEATURE_FMA)
             V8 part = __builtin_elementwise_fma(a, s, -0.5f - whole);
 #else
             V8 part = a * s - 0.5f - whole;

@@ -129,11 +129,11 @@ class BTF(Material):
         lanes = kernels.eval_lanes(dispatch.lanes(self.device), quads)
         words = dispatch.worker_count() * kernels.eval_scratch(self.layout, lanes) if lanes > 4 else 1
         dispatch.launch(
-            kernels.make_eval_kernel(self.layout, lanes, quads),
+            kernels.make_eval_kernel(self.layout, lanes),
             dispatch.blocks(rows * per_row, lanes),
             inputs=[
                 self._arguments, at.flatten(), levels, 0 if single else 1, incoming.flatten(), outgoing.flatten(),
-                rows * per_row, wp.empty(words, dtype=wp.float32, device=self.device),
+                2 if quads else 0, rows * per_row, wp.empty(words, dtype=wp.float32, device=self.device),
             ],
             outputs=[result.flatten()],
             device=self.device,

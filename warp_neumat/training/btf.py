@@ -125,9 +125,12 @@ class BTFData:
         """Return what was understood of the source and what will be made of it, for people."""
         notes = "".join(f"note: {note}\n" for note in source.notes)
         coarse = f", coarse {shape.coarse_channels} features, {shape.coarse}" if shape.coarse else ""
+        fewer = shape.channels > shape.hidden[0] or bool(shape.coarse) and shape.coarse_channels > shape.coarse[0]
+        stored = "; stored with no more features than first layers have units" if fewer else ""
         return (
             f"{notes}{source.name}: {source.width}×{source.height} texels, {len(source.lights)} lights × "
-            f"{len(source.views)} views; fine {shape.channels} features, {shape.hidden}{coarse}; {shape.mips} mips"
+            f"{len(source.views)} views; fine {shape.channels} features, {shape.hidden}{coarse}; "
+            f"{shape.mips} mips{stored}"
         )
 
     @staticmethod
@@ -202,7 +205,8 @@ class Distillation:
         plan = dataclasses.asdict(self._teacher_plan())
         del plan["checkpoint_seconds"]
         source = {name: self.identity.get(name) for name in ("source", "opening")}
-        data = hashlib.sha256(self.source.slices(np.zeros((1, 2), np.int64)).tobytes()).hexdigest()
+        spread = np.random.default_rng(0).integers(0, (len(self.source.lights), len(self.source.views)), (16, 2))
+        data = hashlib.sha256(self.source.slices(spread).tobytes()).hexdigest()
         return {
             "config": repr(self._teacher_config()),
             "plan": plan,
