@@ -224,7 +224,7 @@ def test_a_broken_picture_is_one_line(run, maps, tmp_path, keep):
     ("arguments", "code", "message"),
     [
         (("--preset", "3k"), 2, "--preset must be one of 0.5k, 1k, 2k, 2k++, quick, standard, fine, got '3k'"),
-        (("--model", "bfc"), 2, "--model must be one of neubrdf, bcf, got 'bfc'; nearest: bcf"),
+        (("--model", "nbrdf"), 2, "--model must be one of neubrdf, bcf, btf, got 'nbrdf'; nearest: neubrdf"),
         (("--features", "16,x"), 2, "--features must be whole numbers"),
         (("--features", "16,8", "--preset", "1k"), 1, "give a preset, features or bytes, not two of them"),
         (("--size", "0x4"), 2, "--size must be WxH or the longer side"),
