@@ -4,10 +4,10 @@ What :mod:`warp_neumat.training` relies on, of every module: ``DATA`` (kind of s
 ``configure(source, options) -> config``, ``build(config, seed, …) -> model`` (a ``torch.nn.Module``) and
 ``DEFAULT_STEPS``; of a model: ``to_asset(…)`` and ``statistics()``.
 
-Models of reflectance functions (``DATA = "brdf"``) are trained by :mod:`warp_neumat.training.loop` and further have
+Models of reflectance (``DATA = "brdf"`` and ``"btf"``) are trained by :mod:`warp_neumat.training.loop` and further have
 ``from_asset(tensors, config)``, ``prepare(samples) -> batch``, ``predict(batch)``, ``gradients(batch, loss)``,
 ``event_samples()``, ``stages()``, ``trainable(stage)``, ``rates(parameters)``, ``step_threads``, ``begin``, ``enter``,
-``event`` and ``evaluate(*inputs)``;
+``event``, and those of BRDFs ``evaluate(*inputs)``;
 :class:`warp_neumat.models.neubrdf.NeuBRDF` says what each does. Models of texture sets (``"maps"``) are trained by
 :mod:`warp_neumat.training.block_loop`, which knows the buffers of :class:`warp_neumat.models.bcf.BCf`.
 """

@@ -330,7 +330,7 @@ class BTF(nn.Module):
                     continue
                 before, after = self.layers()[place][0], other.layers()[place][0]
                 head = before.shape[1] - mine.shape[2]
-                its[...] = mine @ before[:, head:].T.numpy()
+                its[...] = mine @ before[:, head:].T.cpu().numpy()
                 after[:, :head] = before[:, :head]
                 after[:, head:] = torch.eye(len(before))
         return other
@@ -351,8 +351,9 @@ class BTF(nn.Module):
         large and the others are small.
         """
         deep = len(self.config.coarse)
+        everything = self.mips()
         with torch.no_grad():
-            for place, mips in ((deep, self.mips()[: self.config.mips]), (0, self.mips()[self.config.mips :])):
+            for place, mips in ((deep, everything[: self.config.mips]), (0, everything[self.config.mips :])):
                 if not mips:
                     continue
                 rows = np.concatenate([mip.reshape(-1, mip.shape[2]) for mip in mips]).astype(np.float64)
@@ -362,6 +363,7 @@ class BTF(nn.Module):
                 weight[:, -len(axes) :] = weight[:, -len(axes) :] @ torch.from_numpy(axes.T.copy()).to(weight)
                 for mip in mips:
                     mip[...] = mip @ axes.T
+            self.texels.copy_(torch.from_numpy(np.concatenate([mip.ravel() for mip in everything])))
 
     def load_state_dict(self, state, *args, **kwargs):
         """Take over a state, of this model or of what became of it when its features were to be blocks."""
@@ -391,7 +393,7 @@ class BTF(nn.Module):
         return tensors, {"kind": "btf", "version": VERSION, "config": self.config.asset()}
 
     def mips(self) -> list[np.ndarray]:
-        """Return the features (h, w, C) float32 of every mip, fine and then coarse."""
+        """Return the features (h, w, C) float32 of every mip, fine and then coarse; on the CPU views of them."""
         texels = self.texels.detach().cpu().numpy()
         return [
             texels[at : at + w * h * c].reshape(h, w, c)

@@ -40,6 +40,10 @@ class BTFStep:
                 raise ValueError(
                     f"{name} must be contiguous float32 of shape ({size},), got {tensor.dtype} {tuple(tensor.shape)}"
                 )
+        if table.numel() >= 1 << 31:
+            raise ValueError(
+                f"table must have fewer than 2³¹ numbers, got {table.numel()}; use fewer features or texels"
+            )
         count = 2 if shape.coarse else 1
         if len(levels) % count:
             raise ValueError(

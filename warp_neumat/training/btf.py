@@ -155,7 +155,7 @@ class Distillation:
     def __init__(self, module, source, shape: BTFConfig, plan, device, *, checkpoint, identity, progress=None):
         self.module, self.source, self.shape, self.plan, self.device = module, source, shape, plan, device
         self.checkpoint, self.identity, self.progress = checkpoint, identity, progress or (lambda fraction, text: None)
-        self._resume = False
+        self._resume, self._data = False, None
         self._trainer: Trainer | None = None
         self.scale = None
 
@@ -206,12 +206,13 @@ class Distillation:
         del plan["checkpoint_seconds"]
         source = {name: self.identity.get(name) for name in ("source", "opening")}
         spread = np.random.default_rng(0).integers(0, (len(self.source.lights), len(self.source.views)), (16, 2))
-        data = hashlib.sha256(self.source.slices(spread).tobytes()).hexdigest()
+        if self._data is None:  # asked for several times, and slices of a large file cost
+            self._data = hashlib.sha256(self.source.slices(spread).tobytes()).hexdigest()
         return {
             "config": repr(self._teacher_config()),
             "plan": plan,
             "version": self.module.VERSION,
-            "data": data,
+            "data": self._data,
             **source,
         }
 
