@@ -10,8 +10,32 @@ def _unit(v):
     return v / np.linalg.norm(v, axis=-1, keepdims=True)
 
 
+def raised(viewer, normals) -> np.ndarray:
+    """Return unit vectors ``viewer``, those lower than :data:`HORIZON` over unit ``normals`` raised to it."""
+    z = (viewer * normals).sum(axis=1, keepdims=True)
+    flat = viewer - normals * z
+    flat = flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-300)
+    return np.where(z < HORIZON, flat * np.sqrt(1 - HORIZON**2) + normals * HORIZON, viewer)
+
+
+def punctual(away, reach=np.inf, axis=None, inner=0.0, outer=np.pi) -> np.ndarray:
+    """Return what range and cone of one light leave of its intensity, (N,) float64, as KHR_lights_punctual says.
+
+    Args:
+        away: Vectors from the light, (N, 3).
+        reach: Its range.
+        axis: The way a spot shines, (3,); None = no spot.
+        inner, outer: Half angles of its cone [radian].
+    """
+    window = np.clip(1 - (np.linalg.norm(away, axis=-1) / reach) ** 4, 0, 1)
+    if axis is None or outer == np.pi:
+        return window
+    cosine = _unit(away) @ _unit(np.asarray(axis, np.float64))
+    return window * np.clip((cosine - np.cos(outer)) / (np.cos(inner) - np.cos(outer)), 0, 1) ** 2
+
+
 def shade(
-    points, normals, tangents, corner_weights, eye, position, intensity, evaluate, *, projected=False
+    points, normals, tangents, corner_weights, eye, position, intensity, evaluate, *, projected=False, limits=None
 ) -> np.ndarray:
     """Return the radiance of samples on triangles, (N, 3) float64.
 
@@ -22,6 +46,7 @@ def shade(
         position, intensity: Of the lights, (L, 3) each.
         evaluate: ``evaluate(wi, wo) -> (N, 3)``, BRDF without the cosine; local directions. With ``projected``, it is
             ``evaluate(wi, wo, lit)``, ``lit`` says which of the N samples are asked for, and the cosine is included.
+        limits: For each light, what :func:`punctual` takes after its first argument; None = all shine without end.
     """
     weights = np.asarray(corner_weights, np.float64)[..., None]
     p = (np.asarray(points, np.float64) * weights).sum(1)
@@ -35,11 +60,13 @@ def shade(
     flat = np.linalg.norm(wo[low, :2], axis=1, keepdims=True)
     wo[low] = np.concatenate([wo[low, :2] / flat * np.sqrt(1 - HORIZON**2), np.full_like(flat, HORIZON)], axis=1)
     radiance = np.zeros_like(p)
-    for at, power in zip(np.asarray(position, np.float64), np.asarray(intensity, np.float64), strict=True):
+    limits = [()] * len(position) if limits is None else limits
+    position, intensity = np.asarray(position, np.float64), np.asarray(intensity, np.float64)
+    for at, power, limit in zip(position, intensity, limits, strict=True):
         d = at - p
         wi = np.einsum("nij,nj->ni", frame, _unit(d))
         lit = wi[:, 2] > 0
-        irradiance = power / (d[lit] ** 2).sum(1, keepdims=True)
+        irradiance = power * punctual(-d[lit], *limit)[:, None] / (d[lit] ** 2).sum(1, keepdims=True)
         if projected:
             radiance[lit] += evaluate(wi[lit], wo[lit], lit) * irradiance
         else:
