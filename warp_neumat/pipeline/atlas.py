@@ -17,6 +17,7 @@ mirrored halves, which artists like to lay on top of each other, are two charts 
 """
 
 import dataclasses
+import functools
 import hashlib
 import os
 import tempfile
@@ -42,6 +43,24 @@ CACHE_VERSION = 1  # raise it whenever the same request would give another layou
 
 _MODES = ("auto", "authored", "xatlas", "fallback")
 _LOST = 1e-3  # share of a part's surface that may have no place of its own on the sheet: specks and needles
+
+
+@dataclasses.dataclass(frozen=True)
+class AtlasLayout:
+    """Where the triangles of a mesh sequence lie on a sheet that nobody has rasterised: no array has its texels.
+
+    A :class:`StreamingAtlas` rasterises chart by chart, each into a rectangle of its own. So charts may overlap here,
+    and how far they lie apart does not matter.
+
+    Attributes:
+        resolution, corner_uv, chart, sources, notes: As of :class:`Atlas`.
+    """
+
+    resolution: int
+    corner_uv: np.ndarray
+    chart: np.ndarray
+    sources: dict[str, str]
+    notes: list[str]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -114,27 +133,27 @@ class Atlas:
             ValueError: On a bad option, with ``uv="authored"`` on a part whose UVs are unusable, and if there are too
                 many triangles for the resolution.
         """
-        if not (16 <= resolution <= 16384 and resolution % 2 == 0):
-            raise ValueError(f"resolution must be even and in 16 … 16384, got {resolution}")
-        if not 2 <= padding <= 64:
-            raise ValueError(f"padding must be in 2 … 64 texels, got {padding}")
-        if uv not in _MODES:
-            raise ValueError(f"uv must be one of {', '.join(_MODES)}, got {uv!r}")
-        if not time_limit > 0:
-            raise ValueError(f"time_limit must be a positive number of seconds, got {time_limit}")
-        file = _cache_file(sequence, resolution, padding, uv, cache)
-        layout = None if file is None else _read_layout(file, len(sequence.faces), time_limit)
-        raster = _raster(layout, resolution, padding, device)
-        if raster is not None:
-            return cls(resolution, layout.corner_uv, layout.chart, *raster, layout.sources, layout.notes)
-        layout, raster = _Maker(sequence, resolution, padding, uv, time_limit, progress, device).make()
-        notes = list(layout.notes)
-        if file is not None and layout.keep:
-            try:
-                _write_layout(file, layout, time_limit)
-            except OSError as error:
-                notes.append(f"the layout was not cached: {error}")
-        return cls(resolution, layout.corner_uv, layout.chart, *raster, layout.sources, notes)
+        layout, raster = _lay_out(sequence, resolution, padding, uv, time_limit, cache, progress, device, True)
+        return cls(resolution, layout.corner_uv, layout.chart, *raster, layout.sources, layout.notes)
+
+    @staticmethod
+    def layout(
+        sequence,
+        resolution: int,
+        *,
+        padding: int = 4,
+        uv: str = "auto",
+        time_limit: float = 60.0,
+        cache=True,
+        progress=None,
+        device=None,
+    ) -> AtlasLayout:
+        """Lay out the sheet of a mesh sequence without rasterising it; arguments and errors as for :meth:`build`.
+
+        A part's own UVs are kept as they are more often than by :meth:`build`, which needs space between charts.
+        """
+        layout, _ = _lay_out(sequence, resolution, padding, uv, time_limit, cache, progress, device, False)
+        return AtlasLayout(resolution, layout.corner_uv, layout.chart, layout.sources, layout.notes)
 
 
 @dataclasses.dataclass
@@ -156,12 +175,46 @@ def _raster(layout: _Layout | None, resolution: int, padding: int, device):
     return None if atlas_leaks(layout.corner_uv, layout.chart, raster[0], device=device).any() else raster
 
 
+def _lay_out(sequence, resolution, padding, uv, time_limit, cache, progress, device, raster: bool):
+    """Return ``(layout, (triangle, barycentric))``, from the cache if it has them, or ``(layout, ())`` unrasterised."""
+    if not (16 <= resolution <= 16384 and resolution % 2 == 0):
+        raise ValueError(f"resolution must be even and in 16 … 16384, got {resolution}")
+    if not 2 <= padding <= 64:
+        raise ValueError(f"padding must be in 2 … 64 texels, got {padding}")
+    if uv not in _MODES:
+        raise ValueError(f"uv must be one of {', '.join(_MODES)}, got {uv!r}")
+    if not time_limit > 0:
+        raise ValueError(f"time_limit must be a positive number of seconds, got {time_limit}")
+    rasterise = (
+        functools.partial(_raster, resolution=resolution, padding=padding, device=device) if raster else _unchecked
+    )
+    file = _cache_file(sequence, resolution, padding, uv if raster else f"{uv}|layout", cache)
+    layout = None if file is None else _read_layout(file, len(sequence.faces), time_limit)
+    made = rasterise(layout)
+    if made is not None:
+        return layout, made
+    layout, made = _Maker(sequence, resolution, padding, uv, time_limit, progress, device, rasterise).make()
+    if file is not None and layout.keep:
+        try:
+            _write_layout(file, layout, time_limit)
+        except OSError as error:
+            notes = [*layout.notes, f"the layout was not cached: {error}"]
+            layout = dataclasses.replace(layout, notes=notes)
+    return layout, made
+
+
+def _unchecked(layout: _Layout | None):
+    """Stand in for :func:`_raster` where charts are rasterised one by one: any layout will do."""
+    return None if layout is None else ()
+
+
 class _Maker:
     """One request to lay out a sequence: the mesh, seen as parts and charts, and the steps from best to safest."""
 
-    def __init__(self, sequence, resolution, padding, uv, time_limit, progress, device):
+    def __init__(self, sequence, resolution, padding, uv, time_limit, progress, device, raster):
         self.resolution, self.padding, self.mode = resolution, padding, uv
         self.time_limit, self.progress, self.device = time_limit, progress, device
+        self._raster = raster
         self.names = list(sequence.mesh_names)
         self.part = np.asarray(sequence.face_mesh)
         points = np.asarray(sequence.frame(0).points, np.float32) + np.float32(0)  # −0 becomes 0: equal when compared
@@ -197,7 +250,8 @@ class _Maker:
         made = np.isin(self.part, list(unusable))
         notes = [f"{self.names[p]}: {reason}" for p, reason in unusable.items() if self.mode == "auto"]
         failure = None
-        if self.mode != "fallback":
+        packed = self.mode == "fallback" or (self._raster is _unchecked and not made.any())  # xatlas only packs tighter
+        if not packed:
             try:
                 layout = self._xatlas(made, surface_uv, chart, notes)
                 raster = self._raster(layout)
@@ -214,9 +268,6 @@ class _Maker:
         if raster is None:
             raise RuntimeError("the fallback layout breaks the footprint guarantee; please report this mesh")
         return layout, raster
-
-    def _raster(self, layout):
-        return _raster(layout, self.resolution, self.padding, self.device)
 
     def _authored(self, mine, chart, surface_uv) -> str | None:
         """Find the charts of one part's own UVs and write them to ``chart`` and ``surface_uv``, or say why not."""
