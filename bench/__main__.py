@@ -1,5 +1,7 @@
-"""Command line of the benchmarks: ``python -m bench NAME [--json FILE] [--device D] [--quick]`` or ``--list``.
+"""Command line of the benchmarks: ``python -m bench NAME [SEQUENCE] [--json FILE] [--device D] [--quick]``, ``--list``.
 
+A benchmark declares what it takes by the parameters of its ``rows``: ``device`` and ``quick`` all of them, ``sequence``
+those that can be told what to render, ``plot`` those that draw: the path, less its suffix, of pictures beside the JSON.
 Exit code 0 ok, 1 the benchmark failed, 2 bad arguments. The JSON holds ``{bench, machine, versions, rows[]}`` and is
 written once, when every row is measured.
 """
@@ -8,6 +10,7 @@ import argparse
 import ast
 import difflib
 import importlib
+import inspect
 import json
 import math
 import os
@@ -107,6 +110,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run one benchmark as the command line asks and return the exit code."""
     parser = argparse.ArgumentParser(prog="python -m bench", description="Measure speed and error on this machine.")
     parser.add_argument("name", nargs="?", metavar="NAME", help="which benchmark; --list shows them")
+    parser.add_argument("sequence", nargs="?", metavar="SEQUENCE", help="what to render, for those that can be told")
     parser.add_argument("--list", action="store_true", help="show the benchmarks and leave")
     parser.add_argument(
         "--json", type=Path, metavar="FILE", help="also write the rows, the machine and the versions here"
@@ -134,7 +138,14 @@ def main(arguments: list[str] | None = None) -> int:
 
         warp.config.log_level = warp.LOG_WARNING
         module = importlib.import_module(f"bench.{options.name}")
-        rows = module.rows(device=options.device, quick=options.quick)
+        takes, more = inspect.signature(module.rows).parameters, {}
+        if options.sequence is not None:
+            if "sequence" not in takes:
+                return _fail(f"{options.name} takes no SEQUENCE, got {options.sequence!r}", 2)
+            more["sequence"] = options.sequence
+        if "plot" in takes:
+            more["plot"] = options.json.with_suffix("") if options.json else Path("out") / options.name
+        rows = module.rows(device=options.device, quick=options.quick, **more)
         document = run(options.name, rows, module.COLUMNS, Console(highlight=False))
         if options.json:
             with replacing(options.json) as temporary:

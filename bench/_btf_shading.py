@@ -15,8 +15,9 @@ import warp as wp
 
 from warp_neumat.materials.btf import BTF
 from warp_neumat.pipeline.camera import Camera
+from warp_neumat.pipeline.lights import PointLights
 from warp_neumat.pipeline.sequence import MeshSequence
-from warp_neumat.pipeline.surface_mesh import SurfaceMesh, bind_materials, map_sizes
+from warp_neumat.pipeline.surface_mesh import Facing, SurfaceMesh, bind_materials, map_sizes
 from warp_neumat.pipeline.texel_shader import TexelShader
 
 from ._btf_networks import SIDE, asset, least, line, surplus
@@ -78,14 +79,16 @@ class Stage:
         mesh = SurfaceMesh(sequence, face_material, map_sizes(sequence, face_material, listed), device=device)
         triangle, barycentric = owners(count, side)
         owner = wp.array((face_material[triangle] + 1).astype(np.uint8).ravel(), dtype=wp.uint8, device=device)
+        facing = Facing(mesh)
         self.shader = TexelShader(
-            mesh, listed, wp.array(triangle, dtype=wp.int32, device=device),
+            mesh, facing, listed, wp.array(triangle, dtype=wp.int32, device=device),
             wp.array(barycentric, dtype=wp.float32, device=device), owner, capacity,
         )  # fmt: skip
         view = {"fov_y": 2 * math.atan(0.5 / DISTANCE), "width": count * side, "height": side}
         self.camera = Camera.look_at((0.0, 0.0, DISTANCE), (0.0, 0.0, 0.0), **view)
         mesh.show(0)
-        mesh.freeze(self.camera.eye)
+        mesh.freeze()
+        facing.update(self.camera)
         self.shader.seen.fill_(1)
         self.texels = triangle.size
         self._mesh = mesh
@@ -96,9 +99,10 @@ class Stage:
         position = np.zeros((above + below, 3))
         position[:above] = np.stack([np.cos(turn), np.sin(turn), np.full(above, HEIGHT)], 1)
         position[above:, 2] = -HEIGHT
-        self.shader.begin(self.camera, position, np.full((above + below, 3), 10.0))
+        self.shader.begin(self.camera, PointLights(position, np.full((above + below, 3), 10.0)).at(0))
+        self.shader.forget()
         self.shader.list()
-        return self.shader.shade()
+        return self.shader.shade().evaluations
 
 
 def _materials(shape: str, count: int, device) -> list[BTF]:

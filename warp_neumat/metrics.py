@@ -1,4 +1,4 @@
-"""How far a picture is from its reference: MAE, RMSE, PSNR, SSIM, FLIP; of texture maps, also angles of normals.
+"""How far a picture is from its reference: MAE, RMSE, PSNR, SSIM, FLIP, flicker; of maps, also angles of normals.
 
 The first group compares display-referred pictures: sRGB-encoded, shape (H, W, 3), float32, values in [0, 1] (tonemap
 first). The second, from :func:`channel_mse` on, compares texture maps of any number of channels, as encoded, and any
@@ -106,6 +106,24 @@ def flip(reference, test, *, pixels_per_degree: float | None = None) -> tuple[fl
         part, _, _ = evaluate(*pictures, "LDR", inputsRGB=True, applyMagma=False, parameters=parameters)
         errors[window] = np.asarray(part, dtype=np.float32).reshape(errors[window].shape)
     return float(errors.mean(dtype=np.float64)), errors
+
+
+def flicker(reference, test, last_reference, last_test) -> float:
+    """Return the mean absolute difference between how a picture changed and how its reference did.
+
+    That is mean |(test − last_test) − (reference − last_reference)| over pixels and channels: what is wrong in the
+    same way in both frames does not flicker, what jumps where the reference glides does.
+
+    Args:
+        reference, test: Display-referred pictures of a frame.
+        last_reference, last_test: Those of the frame before it, of the same shape.
+    """
+    reference, test = _pair(reference, test)
+    last_reference, last_test = _pair(last_reference, last_test)
+    if reference.shape != last_reference.shape:
+        raise ValueError(f"both frames must have the same shape, got {reference.shape} and {last_reference.shape}")
+    change = (test - reference) - (last_test - last_reference)
+    return float(np.abs(change, out=change).mean(dtype=np.float64))
 
 
 # Degrees from a pixel to the farthest one that its filters see: 3 σ of the widest Gaussian, of the blue-yellow channel.

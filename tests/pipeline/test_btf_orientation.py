@@ -58,7 +58,7 @@ def picture(material, wi, wo):
     camera = Still(tuple(FAR * wo), fov=2.4 / FAR, size=size)
     renderer = Renderer(square, {"*": material}, space="screen", size=size, camera=camera, lights=lights)
     image = renderer.frame(0).image
-    triangle, b = renderer.raster.triangle.numpy(), renderer.raster.barycentric.numpy()
+    triangle, b = renderer.view.raster.triangle.numpy(), renderer.view.raster.barycentric.numpy()
     seen = triangle >= 0
     corners = square.uv[square.faces[triangle[seen]]]
     weights = np.concatenate([1 - b[seen].sum(-1, keepdims=True), b[seen]], -1)[..., None]

@@ -100,9 +100,9 @@ def _sheet(middle=(-0.2, 0.5)):
 
 def _reference(renderer, sequence, texels):
     """uv and level of every covered pixel, in float64."""
-    triangle = renderer.raster.triangle.numpy()
+    triangle = renderer.view.raster.triangle.numpy()
     covered = triangle >= 0
-    b1, b2 = renderer.raster.barycentric.numpy()[covered].astype(np.float64).T
+    b1, b2 = renderer.view.raster.barycentric.numpy()[covered].astype(np.float64).T
     corners = sequence.faces[triangle[covered]]
     uv = (sequence.uv[corners].astype(np.float64) * np.stack([1 - b1 - b2, b1, b2], 1)[..., None]).sum(1)
     y, x = np.nonzero(covered)

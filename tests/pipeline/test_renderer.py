@@ -4,12 +4,14 @@ import numpy as np
 import pytest
 
 from tests.fake_assets import random_neubrdf
+from warp_neumat import metrics
 from warp_neumat.materials.neubrdf import NeuBRDF
 from warp_neumat.pipeline.atlas import Atlas
 from warp_neumat.pipeline.camera import Camera, CameraPath
 from warp_neumat.pipeline.lights import PointLights
 from warp_neumat.pipeline.renderer import SKIPS, Renderer
 from warp_neumat.pipeline.sequence import MeshSequence
+from warp_neumat.pipeline.tonemap import tonemap
 from warp_neumat.reference import shade as reference
 from warp_neumat.reference.neubrdf import reference_eval
 
@@ -27,11 +29,14 @@ class Still(CameraPath):
 
 
 class Turning(CameraPath):
-    """A camera that runs around the origin, quickly."""
+    """A camera that runs around the origin, by ``step`` [rad] a frame."""
+
+    def __init__(self, step=0.5, distance=4.0):
+        self._step, self._distance = step, distance
 
     def at(self, frame):
-        angle = 0.5 * frame
-        eye = (4 * np.sin(angle), 1.0, 4 * np.cos(angle))
+        angle = self._step * frame
+        eye = (self._distance * np.sin(angle), 1.0, self._distance * np.cos(angle))
         return Camera.look_at(eye, (0, 0, 0), fov_y=0.7, width=SIZE[0], height=SIZE[1], near=0.1, far=100.0)
 
 
@@ -85,8 +90,8 @@ def _renderer(sphere, material, **options):
 def test_screen_space_matches_float64(sphere, asset, material):
     renderer = _renderer(sphere, material, space="screen", background=(0.25, 0.5, 0.75))
     frame = renderer.frame(0)
-    triangle = renderer.raster.triangle.numpy()
-    weights = renderer.raster.barycentric.numpy().astype(np.float64)
+    triangle = renderer.view.raster.triangle.numpy()
+    weights = renderer.view.raster.barycentric.numpy().astype(np.float64)
     covered = triangle >= 0
     assert covered.sum() > 1000
     b1, b2 = weights[covered].T
@@ -99,7 +104,7 @@ def test_screen_space_matches_float64(sphere, asset, material):
         mesh.tangents[corners],
         np.stack([1 - b1 - b2, b1, b2], axis=1),
         renderer.camera.at(0).eye,
-        *LIGHTS.at(0),
+        *LIGHTS.at(0)[:2],
         lambda wi, wo: reference_eval(tensors, header["config"], wi, wo),
     )
     got = frame.image[covered]
@@ -115,9 +120,9 @@ def test_a_neural_texture_is_shaded_where_it_lies(sphere):
     tensors["codebook"] = (0.25 * tensors["codebook"].astype(np.float32)).astype(np.float16)
     renderer = _renderer(sphere, NeuBRDF(tensors, header), space="screen")
     frame = renderer.frame(0)
-    triangle = renderer.raster.triangle.numpy()
+    triangle = renderer.view.raster.triangle.numpy()
     covered = triangle >= 0
-    b1, b2 = renderer.raster.barycentric.numpy().astype(np.float64)[covered].T
+    b1, b2 = renderer.view.raster.barycentric.numpy().astype(np.float64)[covered].T
     weights, mesh, corners = np.stack([1 - b1 - b2, b1, b2], axis=1), sphere.frame(0), sphere.faces[triangle[covered]]
     uv = (sphere.uv[corners] * weights[..., None]).sum(1)
 
@@ -128,7 +133,7 @@ def test_a_neural_texture_is_shaded_where_it_lies(sphere):
             mesh.tangents[corners],
             weights,
             renderer.camera.at(0).eye,
-            *LIGHTS.at(0),
+            *LIGHTS.at(0)[:2],
             lambda wi, wo, lit: reference_eval(tensors, header["config"], wi, wo, uv=uv[lit]) * wi[:, 2:],
             projected=True,
         )
@@ -140,7 +145,7 @@ def test_a_neural_texture_is_shaded_where_it_lies(sphere):
 
 
 def test_texture_space_without_reuse_is_close_to_screen_space(sphere, material, atlas):
-    ours = _renderer(sphere, material, atlas=atlas, interval=0).frame(0).image.copy()
+    ours = _renderer(sphere, material, atlas=atlas, policy="every").frame(0).image.copy()
     screen = _renderer(sphere, material, space="screen").frame(0).image
     inside = screen.sum(2) > 0
     error = np.abs(ours - screen).max(2)
@@ -148,30 +153,24 @@ def test_texture_space_without_reuse_is_close_to_screen_space(sphere, material, 
     assert error.mean() < 0.01 * screen.max()
 
 
-def test_the_gather_reads_no_texel_that_was_not_shaded(sphere, material, atlas):
-    renderer = _renderer(sphere, material, atlas=atlas, interval=3, camera=Turning())
-    renderer.shader.radiance.assign(np.full(renderer.shader.radiance.shape, np.nan, np.float16))
-    for k in range(8):  # the camera turns by half a radian a frame: much comes into view within an epoch
-        frame = renderer.frame(k)
-        assert np.isfinite(frame.image).all(), f"frame {k} reads texels that nobody shaded"
-        assert frame.stats["updated"] == (k % 4 == 0)
-
-
 def test_reuse_shades_only_what_comes_into_view(sphere, material, atlas):
-    renderer = _renderer(sphere, material, atlas=atlas, interval=2)
-    frame = renderer.frame(0)
-    first, evaluations = frame.image.copy(), [frame.stats["evaluations"]]
-    for _ in range(5):
+    plain = [name for name in SKIPS if name != "rate"]  # rates follow from what the frame before has seen
+    unchanged = [name for name in plain if name != "unchanged"]
+    for skip, third in ((plain, 0), (unchanged, 1)):
+        renderer = _renderer(sphere, material, atlas=atlas, interval=2, skip=skip)
         frame = renderer.frame(0)
-        evaluations.append(frame.stats["evaluations"])
-        assert np.array_equal(frame.image, first)  # nothing moves, so the picture stays
-    assert evaluations[0] > 0
-    assert evaluations == [evaluations[0], 0, 0, evaluations[0], 0, 0]
+        first, evaluations = frame.image.copy(), [frame.stats["evaluations"]]
+        for _ in range(5):
+            frame = renderer.frame(0)
+            evaluations.append(frame.stats["evaluations"])
+            assert np.array_equal(frame.image, first)  # nothing moves, so the picture stays
+        assert evaluations[0] > 0
+        assert evaluations == [evaluations[0], 0, 0, third * evaluations[0], 0, 0]
 
 
 def test_evaluations_follow_what_is_seen(sphere, material, atlas):
     near, far = (
-        _renderer(sphere, material, atlas=atlas, interval=0, camera=Still(eye)).frame(0).stats
+        _renderer(sphere, material, atlas=atlas, policy="every", camera=Still(eye)).frame(0).stats
         for eye in ((0, 0, 4.0), (0, 0, 14.0))
     )
     seen = far["texels"]["seen"] / near["texels"]["seen"]
@@ -179,33 +178,97 @@ def test_evaluations_follow_what_is_seen(sphere, material, atlas):
     assert far["texels"]["owned"] == near["texels"]["owned"]
     assert near["texels"]["shaded"] == near["texels"]["seen"]  # what is read and nothing else
     assert 0.7 * seen < far["evaluations"] / near["evaluations"] < 1.4 * seen
-    away = (
-        _renderer(sphere, material, atlas=atlas, interval=0, camera=Still((0, 0, 4.0), target=(0, 0, 9))).frame(0).stats
+    away = Still((0, 0, 4.0), target=(0, 0, 9))
+    assert _renderer(sphere, material, atlas=atlas, camera=away).frame(0).stats["evaluations"] == 0
+
+
+def test_texel_skips_nest_and_change_no_pixel(sphere, material, atlas):
+    plain = [name for name in SKIPS if name != "rate"]
+    off, shots = [], []
+    for name in (None, "occluded", "offscreen", "backfacing", "unowned"):
+        off += [name]
+        skip = [each for each in plain if each not in off]
+        camera = Still((0.5, 0.8, 2.2), target=(0.6, 0, 0))  # cuts the sphere
+        frame = _renderer(sphere, material, atlas=atlas, policy="every", skip=skip, camera=camera).frame(0)
+        shots.append((frame.image.copy(), frame.stats))
+    for picture, _ in shots[1:]:
+        assert np.array_equal(picture, shots[0][0])
+    shaded = [stats["texels"]["shaded"] for _, stats in shots]
+    skipped, texels = shots[0][1]["skipped"], shots[0][1]["texels"]
+    assert shaded == sorted(set(shaded))
+    assert shaded[0] == texels["seen"]
+    assert shaded[4] == 128 * 128
+    for k, name in enumerate(("occluded", "offscreen", "backfacing", "unowned")):
+        # A texel that is read may belong to a triangle that faces away: it is counted as such too.
+        assert shaded[k + 1] - shaded[k] == pytest.approx(skipped[name], rel=0.05)
+        assert skipped[name] > 100
+    assert shaded[3] == texels["owned"]
+    assert shaded[2] == pytest.approx(texels["facing"], rel=0.02)
+
+
+SPOTS = PointLights(
+    [[2.0, 3.0, 2.0], [-3.0, 1.0, 1.0], [0.0, -1.5, 1.0]],
+    [[30.0, 28, 25], [8, 10, 14], [9, 15, 9]],
+    range=[np.inf, np.inf, 1.5],
+    direction=[[-2, -3, -2], [3, -1, -1], [0, 0, 1]],
+    inner=[0, 0, 0],
+    outer=[np.pi, 0.3, np.pi],
+)
+
+
+def test_light_skips_change_no_pixel_and_save_what_they_count(sphere, material, atlas):
+    def shot(*off):
+        skip = [name for name in SKIPS if name not in off]
+        frame = _renderer(sphere, material, atlas=atlas, policy="every", lights=SPOTS, skip=skip).frame(0)
+        return frame.image.copy(), frame.stats
+
+    full, stats = shot()
+    for name in ("range", "spot", "horizon"):
+        picture, without = shot(name)
+        assert np.array_equal(picture, full)
+        assert without["skipped"][name] == 0 < stats["skipped"][name]
+        assert without["evaluations"] > stats["evaluations"]
+    picture, without = shot("range", "spot", "horizon")
+    assert np.array_equal(picture, full)
+    assert without["evaluations"] == 3 * without["texels"]["shaded"]
+    saved = sum(stats["skipped"][name] for name in ("range", "spot", "horizon"))
+    assert without["evaluations"] == stats["evaluations"] + saved
+
+
+def test_minified_tiles_are_shaded_coarsely_and_look_the_same(material):
+    """A square whose texels are a little smaller than half a pixel, so that one in four is enough."""
+    square = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], np.float32)
+    uv = np.array([[0, 1], [1, 1], [1, 0], [0, 0]])
+    square = MeshSequence.from_arrays(square, np.array([[0, 1, 2], [0, 2, 3]]), uv)
+    options = {"atlas": Atlas.build(square, 128, cache=False), "policy": "every", "camera": Turning(0.02, 3.0)}
+    coarse, fine = (
+        _renderer(square, material, skip=[name for name in SKIPS if name != off], **options) for off in ("", "rate")
     )
-    assert away["evaluations"] == 0
+    for k in range(3):  # the first frame does not know yet what is minified
+        one, other = coarse.frame(k), fine.frame(k)
+    assert one.stats["evaluations"] < 0.5 * other.stats["evaluations"]
+    assert one.stats["skipped"]["rate"] > 2 * one.stats["texels"]["shaded"]
+    assert other.stats["skipped"]["rate"] == 0
+    assert 0 < metrics.flip(tonemap(other.image), tonemap(one.image))[0] < 2e-3
 
 
-def test_skips_nest_and_change_no_pixel(sphere, material, atlas):
-    shots = {}
-    for skip in (SKIPS, ("unowned", "backfacing"), ("unowned",), ()):
-        frame = _renderer(sphere, material, atlas=atlas, interval=0, skip=skip).frame(0)
-        shots[skip] = (frame.image.copy(), frame.stats)
-    pictures = [picture for picture, _ in shots.values()]
-    for picture in pictures[1:]:
-        assert np.array_equal(picture, pictures[0])
-    texels = [stats["texels"] for _, stats in shots.values()]
-    shaded = [t["shaded"] for t in texels]
-    assert shaded[0] < shaded[1] < shaded[2] < shaded[3] == 128 * 128
-    assert texels[0]["owned"] > texels[0]["facing"] > texels[0]["seen"]
-    assert shaded[2] == texels[0]["owned"]
-    assert shaded[0] == texels[0]["seen"]
+def test_a_larger_atlas_costs_no_more_at_the_same_view(sphere, material):
+    """Evaluations follow the pixels: twice the side of the sheet, the same view, minified in both."""
+    small, large = (
+        _renderer(sphere, material, atlas=Atlas.build(sphere, side), policy="every", camera=Turning(distance=12.0))
+        for side in (256, 512)
+    )
+    for k in range(4):
+        costs = [renderer.frame(k).stats["evaluations"] for renderer in (small, large)]
+    assert 0 < costs[1] < 1.2 * costs[0]
 
 
 def test_laziness_changes_no_pixel(sphere, material, atlas):
     """What is shaded when it is first seen equals what would have been shaded at the update."""
+    plain = [name for name in SKIPS if name != "rate"]
+    eagerly = [name for name in plain if name not in ("backfacing", "offscreen", "occluded")]
     moving = [
-        _renderer(sphere, material, atlas=atlas, interval=3, camera=Turning(), skip=skip)
-        for skip in (SKIPS, ("unowned",))
+        _renderer(sphere, material, atlas=atlas, interval=3, camera=Turning(), skip=skip) for skip in (plain, eagerly)
     ]
     for k in range(8):
         lazy, eager = (renderer.frame(k) for renderer in moving)
@@ -245,7 +308,7 @@ def test_two_materials_each_shade_their_own_faces(material, tmp_path):
     dark_tensors, dark_header = random_neubrdf(np.random.default_rng(3), nside=2, bits=3)
     dark_tensors["weight2"][...] = 0
     dark_tensors["bias2"][...] = 0  # exp(0) - 1: a perfectly black material
-    options = {"atlas": Atlas.build(pair, 128, cache=tmp_path), "lights": LIGHTS, "size": (96, 48), "interval": 0}
+    options = {"atlas": Atlas.build(pair, 128, cache=tmp_path), "lights": LIGHTS, "size": (96, 48), "policy": "every"}
     camera = Still((0, 0, 6.0), size=(96, 48))
     materials = {"*": material, "right": NeuBRDF(dark_tensors, dark_header)}
     for space in ("texture", "screen"):
@@ -304,14 +367,15 @@ def test_bad_options_are_named(sphere, material, atlas):
         _renderer(sphere, material, interval=-1)
     with pytest.raises(ValueError, match='space must be "texture" or "screen"'):
         _renderer(sphere, material, space="time")
-    with pytest.raises(ValueError, match="skip must be among unowned, backfacing, unseen, got invisible"):
+    with pytest.raises(ValueError, match="skip must be among unowned, .*, horizon, got invisible"):
         _renderer(sphere, material, skip=("invisible",))
 
 
 def test_changing_the_worker_count_between_frames_changes_nothing(sphere, material, atlas):
     from warp_neumat.kernels import dispatch
 
-    renderer = _renderer(sphere, material, atlas=atlas, interval=0)
+    skip = [name for name in SKIPS if name not in ("rate", "unchanged")]
+    renderer = _renderer(sphere, material, atlas=atlas, policy="every", skip=skip)
     first = renderer.frame(0).image.copy()
     try:
         for workers in (1, 3):

@@ -5,6 +5,7 @@ What is not written as it must be raises :class:`warp_neumat.cli.common.Usage`.
 
 import difflib
 import json
+import re
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -26,6 +27,17 @@ def parse_frames(text: str | None, count: int) -> range:
     if not 0 <= first < last:
         raise Usage(f"--frames must be A:B with 0 <= A < B, got {text!r}")
     return range(first, last)
+
+
+def parse_budget(text: str) -> dict[str, float]:
+    """Read ``250k`` or ``1.5M`` evaluations, or ``4ms``, as options of the renderer: budget or milliseconds."""
+    match = re.fullmatch(r"(\d+(?:\.\d*)?|\.\d+)\s*(k|m|ms)?", text.strip(), re.IGNORECASE)
+    number, unit = (float(match[1]), (match[2] or "").lower()) if match else (0.0, "")
+    if number <= 0:
+        raise Usage(f"--budget must be evaluations, as 250k, or milliseconds of shading, as 4ms, got {text!r}")
+    if unit == "ms":
+        return {"milliseconds": number}
+    return {"budget": number * {"": 1, "k": 1e3, "m": 1e6}[unit]}
 
 
 MOST = 16384

@@ -169,10 +169,13 @@ class Job:
         outputs: Further kernel arguments, as in ``wp.launch``.
         device: Warp device; defaults to the current one.
         grain: Fewest blocks worth a chunk of their own: waking a worker costs about 60 µs, a chunk should take longer.
+        slots: Most workers that may run it, where an array holds a part for each; default: any number.
     """
 
-    def __init__(self, kernel, count: int, inputs, outputs=(), *, device=None, grain: int = 4):
-        self.kernel, self.count, self.grain = kernel, int(count), max(1, int(grain))
+    def __init__(
+        self, kernel, count: int, inputs, outputs=(), *, device=None, grain: int = 4, slots: int | None = None
+    ):
+        self.kernel, self.count, self.grain, self._slots = kernel, int(count), max(1, int(grain)), slots
         self.device = wp.get_device(device)
         self._has_slot = len(kernel.adj.args) > 1 and kernel.adj.args[1].label == "slot"
         self._offset = 2 if self._has_slot else 1
@@ -211,7 +214,7 @@ class Job:
             self._commands[0].set_dim(count)
             self._commands[0].launch()
             return
-        workers = min(worker_count(), -(-count // self.grain))
+        workers = min(worker_count(), -(-count // self.grain), self._slots or count)
         if workers == 1:
             self._chunk(0, 0, count)
             return

@@ -10,6 +10,7 @@ writes.
 import warp as wp
 
 from warp_neumat.kernels import dispatch
+from warp_neumat.kernels.tiles import TILE_SHIFT, anchors
 from warp_neumat.kernels.worklist import drawn, footprint
 
 wp.set_module_options(dispatch.module_options())
@@ -26,6 +27,8 @@ def gather_kernel(
     radiance: wp.array(dtype=wp.float16),
     width: int,
     height: int,
+    rate: wp.array(dtype=wp.uint8),
+    columns: int,
     background: wp.vec3,
     # outputs
     blank: wp.array(dtype=wp.uint8),
@@ -41,12 +44,15 @@ def gather_kernel(
         f = pixel_triangle[i]
         if f >= 0:
             x, y, u, v = footprint(corner_uv, f, pixel_barycentric[2 * i], pixel_barycentric[2 * i + 1], width, height)
-            at = 4 * (y * width + x)
-            below = at + 4 * width
+            r = int(rate[(y >> TILE_SHIFT) * columns + (x >> TILE_SHIFT)])
+            x0, y0, s, t = anchors(x, y, u, v, r)
+            at = 4 * (y0 * width + x0)
+            right = 4 << r
+            below = (4 * width) << r
             for c in range(3):
-                top = (1.0 - u) * float(radiance[at + c]) + u * float(radiance[at + 4 + c])
-                bottom = (1.0 - u) * float(radiance[below + c]) + u * float(radiance[below + 4 + c])
-                image[3 * i + c] = (1.0 - v) * top + v * bottom
+                top = (1.0 - s) * float(radiance[at + c]) + s * float(radiance[at + right + c])
+                bottom = (1.0 - s) * float(radiance[at + below + c]) + s * float(radiance[at + below + right + c])
+                image[3 * i + c] = (1.0 - t) * top + t * bottom
         else:
             for c in range(3):
                 image[3 * i + c] = background[c]

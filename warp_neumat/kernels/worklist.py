@@ -8,7 +8,8 @@ the reuse over frames and the repair of what comes into view in between.
 import warp as wp
 
 from warp_neumat.kernels import dispatch
-from warp_neumat.kernels.shade import MASK_SHIFT, ROW_SHIFT
+from warp_neumat.kernels.shade import MASK_SHIFT, RATE_SHIFT, ROW_SHIFT
+from warp_neumat.kernels.tiles import TILE_SHIFT, anchors
 
 wp.set_module_options(dispatch.module_options())
 
@@ -35,11 +36,16 @@ def facing_kernel(
     double_sided: wp.array(dtype=wp.uint8),
     points: wp.array(dtype=wp.float32),
     eye: wp.vec3,
+    clip: wp.mat44,
     per_block: int,
     # outputs
     side: wp.array(dtype=wp.int8),
+    on_screen: wp.array(dtype=wp.uint8),
 ):
-    """Which side of each triangle the eye sees: 1 front, −1 back of a double-sided one, 0 neither."""
+    """Which side of each triangle the eye sees, 1 front, −1 back of a double-sided one, 0 neither; and is it in view.
+
+    ``on_screen`` is 0 where all three corners lie beyond one side of the view volume of ``clip`` (far plane excepted).
+    """
     b = first + wp.tid()
     for f in range(b * per_block, wp.min((b + 1) * per_block, face_count)):
         i0 = 3 * faces[3 * f]
@@ -55,6 +61,14 @@ def facing_kernel(
         elif d < 0.0 and double_sided[f] != wp.uint8(0):
             s = -1
         side[f] = wp.int8(s)
+        c0 = clip * wp.vec4(p[0], p[1], p[2], 1.0)
+        c1 = clip * wp.vec4(p[0] + u[0], p[1] + u[1], p[2] + u[2], 1.0)
+        c2 = clip * wp.vec4(p[0] + v[0], p[1] + v[1], p[2] + v[2], 1.0)
+        out = c0[2] < 0.0 and c1[2] < 0.0 and c2[2] < 0.0
+        for k in range(2):
+            out = out or (c0[k] < -c0[3] and c1[k] < -c1[3] and c2[k] < -c2[3])
+            out = out or (c0[k] > c0[3] and c1[k] > c1[3] and c2[k] > c2[3])
+        on_screen[f] = wp.where(out, wp.uint8(0), wp.uint8(1))
 
 
 @wp.kernel
@@ -63,18 +77,29 @@ def mark_facing_kernel(
     triangle: wp.array(dtype=wp.int32),
     texel_material: wp.array(dtype=wp.uint8),
     side: wp.array(dtype=wp.int8),
+    on_screen: wp.array(dtype=wp.uint8),
     backfacing_too: int,
+    offscreen_too: int,
+    width: int,
     texel_count: int,
+    rate: wp.array(dtype=wp.uint8),
+    columns: int,
     per_block: int,
     # outputs
     seen: wp.array(dtype=wp.uint8),
 ):
-    """Mark every texel whose triangle faces the eye, or every texel with a material."""
+    """Mark every anchor whose triangle faces the eye and is in view, and at will those that do not or are not."""
     b = first + wp.tid()
     for i in range(b * per_block, wp.min((b + 1) * per_block, texel_count)):
-        wanted = backfacing_too != 0 or side[wp.max(triangle[i], 0)] != wp.int8(0)
+        f = wp.max(triangle[i], 0)
+        wanted = backfacing_too != 0 or side[f] != wp.int8(0)
+        wanted = wanted and (offscreen_too != 0 or on_screen[f] != wp.uint8(0))
         if wanted and texel_material[i] != wp.uint8(0):
-            seen[i] = wp.uint8(1)
+            x = i % width
+            y = i // width
+            step = 1 << int(rate[(y >> TILE_SHIFT) * columns + (x >> TILE_SHIFT)])
+            if ((x | y) & (step - 1)) == 0:
+                seen[i] = wp.uint8(1)
 
 
 @wp.func
@@ -97,6 +122,7 @@ def footprint(corner_uv: wp.array(dtype=wp.float32), f: int, b1: float, b2: floa
 @wp.kernel
 def mark_seen_kernel(
     first: int,
+    slot: int,
     pixel_triangle: wp.array(dtype=wp.int32),
     pixel_barycentric: wp.array(dtype=wp.float32),
     pixel_count: int,
@@ -104,10 +130,17 @@ def mark_seen_kernel(
     corner_uv: wp.array(dtype=wp.float32),
     width: int,
     height: int,
+    rate: wp.array(dtype=wp.uint8),
+    columns: int,
+    tiles: int,
     # outputs
     seen: wp.array(dtype=wp.uint8),
+    pixels: wp.array(dtype=wp.int32),
 ):
-    """Mark the texels that the visible pixels will read; blocks may write the same 1 to the same texel."""
+    """Mark the texels that the visible pixels will read, and count the pixels of each tile.
+
+    Blocks may write the same 1 to the same texel. ``pixels`` is [slot][tile], since counts are not atomic over workers.
+    """
     b = first + wp.tid()
     end = wp.min((b + 1) * per_block, pixel_count)
     if drawn(pixel_triangle, b * per_block, end) == 0:
@@ -116,11 +149,17 @@ def mark_seen_kernel(
         f = pixel_triangle[i]
         if f >= 0:
             x, y, u, v = footprint(corner_uv, f, pixel_barycentric[2 * i], pixel_barycentric[2 * i + 1], width, height)
-            at = y * width + x
+            tile = (y >> TILE_SHIFT) * columns + (x >> TILE_SHIFT)
+            r = int(rate[tile])
+            x0, y0, _, _ = anchors(x, y, u, v, r)
+            wp.atomic_add(pixels, slot * tiles + tile, 1)
+            at = y0 * width + x0
+            right = 1 << r
+            below = width << r
             seen[at] = wp.uint8(1)
-            seen[at + 1] = wp.uint8(1)
-            seen[at + width] = wp.uint8(1)
-            seen[at + width + 1] = wp.uint8(1)
+            seen[at + right] = wp.uint8(1)
+            seen[at + below] = wp.uint8(1)
+            seen[at + below + right] = wp.uint8(1)
 
 
 @wp.kernel
@@ -143,52 +182,76 @@ def pixel_material_kernel(
         texel_material[i] = wp.uint8(m)
 
 
-# One row of quads. Most quads are empty, so eight bytes of either texel row are tested at once. A texel outside an
-# image of odd size reads as 0. With `fill`, the cursors are positions in `quads`; without, they count.
+# One row of tiles. Most tiles are empty, so eight bytes of each texel row are tested at once. A texel outside the
+# image reads as 0. With `fill`, the cursors are positions in `quads`; without, they count. A tile that is due shades
+# all that is seen of it, others what is not done. Anchors of the tile's rate are listed as quads of anchors; texels
+# between them, which a neighbour of a finer rate reads, as quads of texels.
 _ROW = """
-    const int columns = (width + 1) >> 1;
-    const int y = 2 * row;
-    const long long at0 = (long long)y * width, at1 = at0 + width;
-    const unsigned char *s0 = seen.data + at0, *m0 = texel_material.data + at0;
-    unsigned char* d0 = done.data + at0;
-    const bool two = y + 1 < height;
-    const unsigned char *s1 = two ? seen.data + at1 : s0, *m1 = two ? texel_material.data + at1 : m0;
-    unsigned char* d1 = two ? done.data + at1 : d0;
+    const int columns = (width + 7) >> 3, y0 = 8 * row, high = height - y0 < 8 ? height - y0 : 8;
     int seen_texels = 0, shaded_texels = 0;
     for (int column = 0; column < columns; ++column) {
-        const int x = 2 * column;
-        if (x + 8 <= width) {
-            unsigned long long a, b;
-            memcpy(&a, s0 + x, 8);
-            memcpy(&b, s1 + x, 8);
-            if (!(a | b)) { column += 3; continue; }
+        const int tile = row * columns + column, x0 = 8 * column, wide = width - x0 < 8 ? width - x0 : 8;
+        unsigned long long marks[8], any = 0;
+        for (int j = 0; j < high; ++j) {
+            const unsigned char* from = seen.data + (long long)(y0 + j) * width + x0;
+            marks[j] = 0;
+            if (wide == 8) memcpy(&marks[j], from, 8);
+            else memcpy(&marks[j], from, wide);
+            any |= marks[j];
         }
-        const bool wide = x + 1 < width;
-        const int s[4] = {s0[x] != 0, wide && s0[x + 1], two && s1[x], two && wide && s1[x + 1]};
-        const int marks = s[0] + s[1] + s[2] + s[3];
-        if (!marks) continue;
-        seen_texels += marks;
-        int m[4];  // material + 1 of the texels that are wanted: seen, owned, and not shaded yet
-        m[0] = s[0] && !d0[x] ? m0[x] : 0;
-        m[1] = s[1] && !d0[x + 1] ? m0[x + 1] : 0;
-        m[2] = s[2] && !d1[x] ? m1[x] : 0;
-        m[3] = s[3] && !d1[x + 1] ? m1[x + 1] : 0;
-        for (int q = 0; q < 4; ++q) {
-            if (!m[q]) continue;
-            int mask = 0;  // of the texels of this material; listed with the first of them
-            for (int p = 0; p < 4; ++p) mask |= (m[p] == m[q]) << p;
-            ++shaded_texels;
-            if (mask & ((1 << q) - 1)) continue;
-            int& next = cursor.data[(m[q] - 1) * rows + row];
-            if (fill) quads.data[next] = column | row << ROW_SHIFT | mask << MASK_SHIFT;
-            ++next;
+        if (!any) {
+            if (!fill) tile_seen.data[tile] = tile_shaded.data[tile] = 0;
+            continue;
+        }
+        const bool all = due.data[tile] != 0;
+        unsigned char wanted[64] = {0};  // material + 1 of what will be shaded
+        int seen_here = 0, shaded_here = 0;
+        for (int j = 0; j < high; ++j) {
+            if (!marks[j]) continue;
+            const long long at = (long long)(y0 + j) * width + x0;
+            for (int i = 0; i < wide; ++i) {
+                if (!(marks[j] >> 8 * i & 255)) continue;
+                ++seen_here;
+                if (all || !done.data[at + i]) wanted[8 * j + i] = texel_material.data[at + i];
+            }
         }
         if (fill) {
-            if (m[0]) d0[x] = 1;
-            if (m[1]) d0[x + 1] = 1;
-            if (m[2]) d1[x] = 1;
-            if (m[3]) d1[x + 1] = 1;
+            for (int j = 0; j < high; ++j) {
+                unsigned char* d = done.data + (long long)(y0 + j) * width + x0;
+                for (int i = 0; i < wide; ++i) d[i] = wanted[8 * j + i] ? 1 : all ? 0 : d[i];
+            }
         }
+        for (int level = rate.data[tile]; level >= 0; level = level ? 0 : -1) {
+            const int across = 4 >> level;
+            for (int b = 0; b < across; ++b) for (int a = 0; a < across; ++a) {
+                int at[4], m[4];
+                for (int q = 0; q < 4; ++q) {
+                    at[q] = ((2 * b + (q >> 1)) << level) * 8 + ((2 * a + (q & 1)) << level);
+                    m[q] = wanted[at[q]];
+                    wanted[at[q]] = 0;
+                }
+                for (int q = 0; q < 4; ++q) {
+                    if (!m[q]) continue;
+                    int mask = 0;  // of the texels of this material; listed with the first of them
+                    for (int p = 0; p < 4; ++p) mask |= (m[p] == m[q]) << p;
+                    ++shaded_here;
+                    if (mask & ((1 << q) - 1)) continue;
+                    int& next = cursor.data[(m[q] - 1) * rows + row];
+                    if (fill) {
+                        const unsigned x = (x0 >> (level + 1)) + a, y = (y0 >> (level + 1)) + b;
+                        const unsigned where = x | y << ROW_SHIFT;
+                        quads.data[next] = (int)(where | (unsigned)mask << MASK_SHIFT | (unsigned)level << RATE_SHIFT);
+                    }
+                    ++next;
+                }
+            }
+        }
+        if (!fill) {
+            tile_seen.data[tile] = seen_here;
+            tile_shaded.data[tile] = shaded_here;
+        }
+        seen_texels += seen_here;
+        shaded_texels += shaded_here;
     }
     if (!fill) {
         seen_count.data[row] = seen_texels;
@@ -197,11 +260,13 @@ _ROW = """
 """
 
 
-@wp.func_native(f"enum {{ ROW_SHIFT = {ROW_SHIFT}, MASK_SHIFT = {MASK_SHIFT} }};" + _ROW)
+@wp.func_native(f"enum {{ ROW_SHIFT = {ROW_SHIFT}, MASK_SHIFT = {MASK_SHIFT}, RATE_SHIFT = {RATE_SHIFT} }};" + _ROW)
 def _list_row(
     row: int,
     seen: wp.array(dtype=wp.uint8),
     texel_material: wp.array(dtype=wp.uint8),
+    rate: wp.array(dtype=wp.uint8),
+    due: wp.array(dtype=wp.uint8),
     width: int,
     height: int,
     rows: int,
@@ -210,6 +275,8 @@ def _list_row(
     cursor: wp.array(dtype=wp.int32),
     seen_count: wp.array(dtype=wp.int32),
     shaded_count: wp.array(dtype=wp.int32),
+    tile_seen: wp.array(dtype=wp.uint8),
+    tile_shaded: wp.array(dtype=wp.uint8),
     quads: wp.array(dtype=wp.int32),
 ): ...
 
@@ -219,6 +286,8 @@ def list_kernel(
     first: int,
     seen: wp.array(dtype=wp.uint8),
     texel_material: wp.array(dtype=wp.uint8),
+    rate: wp.array(dtype=wp.uint8),
+    due: wp.array(dtype=wp.uint8),
     width: int,
     height: int,
     rows: int,
@@ -228,17 +297,22 @@ def list_kernel(
     cursor: wp.array(dtype=wp.int32),
     seen_count: wp.array(dtype=wp.int32),
     shaded_count: wp.array(dtype=wp.int32),
+    tile_seen: wp.array(dtype=wp.uint8),
+    tile_shaded: wp.array(dtype=wp.uint8),
     quads: wp.array(dtype=wp.int32),
 ):
-    """Count (``fill`` = 0), or write (1), the quads of a row that have texels seen but not done; then they are done.
+    """Count (``fill`` = 0), or write (1), the quads of a row of tiles that have texels to shade; then they are done.
 
-    ``cursor`` is [material][row]: counts in the first pass, positions in ``quads`` in the second. ``seen_count`` and
-    ``shaded_count`` [row] receive the texels that are read and those that are listed.
+    ``rate`` and ``due`` are per tile. ``cursor`` is [material][row]: counts in the first pass, positions in ``quads``
+    in the second. ``seen_count`` and ``shaded_count`` [row], ``tile_seen`` and ``tile_shaded`` [tile] receive the
+    texels that are read and those that are listed.
     """
     _list_row(
         first + wp.tid(),
         seen,
         texel_material,
+        rate,
+        due,
         width,
         height,
         rows,
@@ -247,5 +321,7 @@ def list_kernel(
         cursor,
         seen_count,
         shaded_count,
+        tile_seen,
+        tile_shaded,
         quads,
     )

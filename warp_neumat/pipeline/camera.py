@@ -81,6 +81,12 @@ class Camera:
         """World position of the camera, shape (3,), float64."""
         return -self.view[:3, :3].T @ self.view[:3, 3]
 
+    def moved(self, right: float) -> "Camera":
+        """Return the camera that far to the right [scene unit], looking the same way; negative is to the left."""
+        view = self.view.copy()
+        view[0, 3] -= right
+        return dataclasses.replace(self, view=view)
+
     def pixel_steps(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the unit view direction, and what one pixel to the right and one down add to a ray of view depth 1."""
         step = 2.0 * math.tan(0.5 * self.fov_y) / self.height

@@ -2,7 +2,7 @@
 
 import math
 
-from warp_neumat.pipeline.renderer import SKIPS
+from warp_neumat.pipeline.skips import SKIPS
 
 
 def parse_background(text: str) -> tuple[float, float, float]:

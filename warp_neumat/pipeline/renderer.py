@@ -6,34 +6,36 @@ radiance texture). With interval N, every (N + 1)th frame starts a new epoch: it
 all that is seen from then on is shaded as of that frame, when it is first seen. So the radiance texture is the
 paper's, evaluated lazily: what comes into view within an epoch is neither a hole nor newer than its neighbours.
 
+In stereo, all that holds for each of two eyes (``pipeline/stereo.py``).
+
 In screen space, the same shading kernel runs on the camera raster itself, every pixel of every frame: the reference.
 """
 
 import dataclasses
-import operator
-import time
 from collections.abc import Iterable, Iterator
 
 import numpy as np
 import warp as wp
 
-from warp_neumat.kernels import dispatch, gather, worklist
-from warp_neumat.kernels.lod import atlas_lod
-from warp_neumat.kernels.visibility import CameraRaster
-from warp_neumat.pipeline.atlas import Atlas
-from warp_neumat.pipeline.camera import CameraPath, load_camera
+from warp_neumat.materials.proxy import proxy_of
+from warp_neumat.pipeline.atlas import Atlas, AtlasLayout
+from warp_neumat.pipeline.camera import CameraPath, bounding_sphere, load_camera
+from warp_neumat.pipeline.clock import Clock
 from warp_neumat.pipeline.lights import PointLights, lights_from
+from warp_neumat.pipeline.look import Look
+from warp_neumat.pipeline.policy import POLICIES, Policy, make_policy
 from warp_neumat.pipeline.sequence import MeshSequence
+from warp_neumat.pipeline.sheet import Sheet, StreamedSheet, sheet_lod
+from warp_neumat.pipeline.skips import SKIPS, Skips
+from warp_neumat.pipeline.stereo import SharedStereoView, eye_distance_of, screen_stereo, texture_stereo
 from warp_neumat.pipeline.surface_mesh import SurfaceMesh, bind_materials, map_sizes, open_materials
-from warp_neumat.pipeline.texel_shader import TexelShader
+from warp_neumat.pipeline.tonemap import check_operator
+from warp_neumat.pipeline.view import ScreenView, TextureView
 
-SKIPS = ("unowned", "backfacing", "unseen")
-"""Texels that are not shaded: of no chart, of triangles that face away, and those the picture does not read."""
+__all__ = ["POLICIES", "SIDE_MAX", "SKIPS", "RenderedFrame", "Renderer"]
 
 SIDE_MAX = 16384
 """Largest side of a picture or an atlas [px]: a quad's word holds 13 bits for its column and 13 for its row."""
-
-_PIXELS = 4096  # per block of the per-pixel kernels
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,29 +44,22 @@ class RenderedFrame:
 
     Attributes:
         index: Frame number in the sequence.
-        image: Linear Rec. 709 radiance, shape (H, W, 3), float32, row 0 on top.
+        image: Linear Rec. 709 radiance, shape (H, W, 3), float32, row 0 on top; in stereo the left eye's.
         stats: ``ms`` per stage, ``texels`` (owned; facing the viewer of the last update, or two-sided; seen; shaded),
-            ``evaluations`` (material × light), ``updated`` (whether the frame started a new epoch).
+            ``evaluations`` (material × light), ``updated`` (whether the frame started a new epoch). In stereo they
+            are sums over both eyes, ``eyes`` has each one's own, and ``shared``, if tiles may be, theirs.
+        right: The right eye's picture, likewise; None without stereo.
     """
 
     index: int
     image: np.ndarray
     stats: dict
+    right: np.ndarray | None = None
 
-
-class _Clock:
-    """Adds up milliseconds per stage."""
-
-    def __init__(self, device):
-        self.ms, self._device, self._last = {}, device, time.perf_counter()
-
-    def stage(self, name: str) -> None:
-        """End the stage ``name``."""
-        if not self._device.is_cpu:
-            wp.synchronize_device(self._device)
-        now = time.perf_counter()
-        self.ms[name] = self.ms.get(name, 0.0) + 1e3 * (now - self._last)
-        self._last = now
+    @property
+    def eyes(self) -> tuple[np.ndarray, ...]:
+        """The pictures: left and right, or the only one."""
+        return (self.image,) if self.right is None else (self.image, self.right)
 
 
 class Renderer:
@@ -75,14 +70,28 @@ class Renderer:
         materials: Name or glob of meshes, nodes or materials → :class:`Material` or path of an asset.
         space: ``"texture"`` shades the atlas and reuses it; ``"screen"`` shades every pixel of every frame.
         atlas: The atlas, or its resolution [texel]; unused in screen space.
+        resident: Side of the sheet [texel] that charts stream onto when they are seen, a multiple of 8; ``atlas`` then
+            says how large they are at most, and is never rasterised. Default: the whole atlas is held.
         size: (width, height) of the pictures [px].
         camera: A camera path, ``"orbit"``, or the path of a camera file.
         lights: The lights, a number of default ones, or the path of a lights file.
         frame_count: Length of the shot, which orbits and default paths are spread over; default: the sequence's.
-        interval: Frames that reuse the shading of the one before them; 0 shades every frame.
-        skip: Which of :data:`SKIPS` are in force. They nest: what is unseen includes what faces away and what no chart
-            owns, so switching off an inner one shows only where the outer ones are off too.
+        policy: When tiles of the atlas are shaded anew, of :data:`POLICIES`, or a :class:`Policy`.
+        interval: Frames that reuse the shading of the one before them; 0 shades every frame. For ``staggered`` and
+            ``adaptive`` the measure of their default budgets.
+        budget: Evaluations that a frame may spend.
+        milliseconds: Milliseconds of shading that a frame may spend.
+        target_flip: Mean FLIP that ``adaptive`` aims for, against per-pixel shading.
+        carry: Whether stale radiance is carried to the present by the materials' proxies (``kernels/carry.py``);
+            default: by ``adaptive`` alone.
+        skip: Which of :data:`SKIPS` are in force.
+        gain: What radiance is multiplied by before it is shown, 2^exposure: what counts as a visible change.
+        tonemap: How the pictures will be shown, as :func:`warp_neumat.tonemap` names it: what ``target_flip`` compares.
         background: Radiance where nothing is seen, 3 values.
+        seed: Decides which of equal tiles comes first.
+        stereo: Whether to render two eyes, to the left and the right of the camera (``pipeline/stereo.py``).
+        eye_distance: Between them [scene unit]; default: a thirtieth of the first camera's distance to the scene.
+        share: Difference between the eyes [√Y as shown] up to which a tile is shaded once for both; default: none is.
         device: Warp device.
         progress: Passed to :meth:`Atlas.build`.
 
@@ -97,30 +106,46 @@ class Renderer:
         *,
         space: str = "texture",
         atlas: Atlas | int = 1200,
+        resident: int | None = None,
         size: tuple[int, int] = (1280, 720),
         camera: CameraPath | str = "orbit",
         lights: PointLights | int | str = 3,
         frame_count: int | None = None,
+        policy: Policy | str = "fixed",
         interval: int = 4,
+        budget: float | None = None,
+        milliseconds: float | None = None,
+        target_flip: float | None = None,
+        carry: bool | None = None,
         skip: Iterable[str] = SKIPS,
+        gain: float = 1.0,
+        tonemap: str = "srgb",
         background=(0.0, 0.0, 0.0),
+        seed: int = 0,
+        stereo: bool = False,
+        eye_distance: float | None = None,
+        share: float | None = None,
         device=None,
         progress=None,
     ):
         if space not in ("texture", "screen"):
             raise ValueError(f'space must be "texture" or "screen", got {space!r}')
-        try:
-            self.interval = operator.index(interval)
-        except TypeError:
-            self.interval = -1
-        if self.interval < 0:
-            raise ValueError(f"interval must be a whole number of frames, 0 or more, got {interval!r}")
         if not all(1 <= side <= SIDE_MAX for side in size):
             raise ValueError(f"size must be 1 to {SIDE_MAX} pixels each way, got {size[0]}x{size[1]}")
-        self.skip = frozenset(skip)
-        if self.skip - set(SKIPS):
-            raise ValueError(f"skip must be among {', '.join(SKIPS)}, got {', '.join(sorted(self.skip - set(SKIPS)))}")
-        self.device, self.space = wp.get_device(device), space
+        for name, value in (("eye_distance", eye_distance), ("share", share)):
+            if value is not None and not stereo:
+                raise ValueError(f"{name} takes two eyes; give stereo=True too")
+        if share is not None and not 0 <= share <= 1:
+            raise ValueError(f"share must be a difference in [0, 1], got {share!r}")
+        if share is not None and space == "screen":
+            raise ValueError('share takes textures; leave it out, or use space="texture"')
+        if share is not None and getattr(policy, "target", target_flip) is not None:
+            raise ValueError("share and target_flip exclude each other; give a budget")
+        skips = Skips.named(skip)
+        if not isinstance(policy, Policy):
+            limits = {"budget": budget, "milliseconds": milliseconds, "target_flip": target_flip}
+            policy = make_policy(policy, interval, **limits)
+        self.device, self.space, self.policy = wp.get_device(device), space, policy
         self.sequence = sequence if isinstance(sequence, MeshSequence) else MeshSequence.load(sequence)
         self.assigned = open_materials(materials, device=self.device)
         self.materials, face_material = bind_materials(self.sequence, self.assigned)
@@ -135,99 +160,67 @@ class Renderer:
             raise ValueError(
                 f"camera must be made for {self.width}x{self.height} pixels, got {first.width}x{first.height}"
             )
-        self.camera = camera
+        self.camera, self.stereo = camera, bool(stereo)
+        self.eye_distance = eye_distance_of(eye_distance, first, *bounding_sphere(lo, hi)) if stereo else None
         self.lights = lights if isinstance(lights, PointLights) else lights_from(lights, lo, hi, frame_count)
-        self.background = wp.vec3(*(float(c) for c in background))
+        check_operator(tonemap, 0.0)
+        self.background, self.gain, self.tonemap = tuple(float(c) for c in background), float(gain), tonemap
 
-        self._map_size = map_sizes(self.sequence, face_material, self.materials)
-        self.mesh = SurfaceMesh(self.sequence, face_material, self._map_size, device=self.device)
-        self.raster = CameraRaster(
-            self.sequence.faces,
-            self.sequence.vertex_count,
-            self.width,
-            self.height,
-            double_sided=self.sequence.face_double_sided,
-            device=self.device,
+        map_size = map_sizes(self.sequence, face_material, self.materials)
+        self.mesh = SurfaceMesh(self.sequence, face_material, map_size, device=self.device)
+        look = Look(
+            self.mesh,
+            self.materials,
+            len(self.lights),
+            (self.width, self.height),
+            wp.vec3(*self.background),
+            self.gain,
+            skips,
+            tonemap,
         )
-        pixels = self.width * self.height
-        self._image = wp.zeros((self.height, self.width, 3), dtype=wp.float32, device=self.device)
-        blank = wp.zeros(dispatch.blocks(pixels, _PIXELS), dtype=wp.uint8, device=self.device)
-        pixel_triangle, pixel_barycentric = self.raster.triangle.flatten(), self.raster.barycentric.flatten()
-
-        def job(kernel, count, inputs, outputs):
-            return dispatch.Job(
-                kernel, dispatch.blocks(count, _PIXELS), inputs=inputs, outputs=outputs, device=self.device, grain=2
-            )
-
+        self._pose = 0  # counts the poses shown
         if space == "screen":
             self.atlas = None
-            material = wp.zeros(pixels, dtype=wp.uint8, device=self.device)
-            self.shader = self._shader(self.raster.triangle, self.raster.barycentric, material)
-            self._mark = job(
-                worklist.pixel_material_kernel,
-                pixels,
-                [pixel_triangle, pixels, _PIXELS, self.mesh.face_material],
-                [material],
+            self.view = screen_stereo(look, 0.5 * self.eye_distance) if stereo else ScreenView(look)
+            return
+        if not isinstance(atlas, (Atlas, AtlasLayout)):
+            make = Atlas.build if resident is None else Atlas.layout
+            atlas = make(self.sequence, atlas, progress=progress, device=self.device)
+        if isinstance(atlas, AtlasLayout) and resident is None:
+            raise ValueError("atlas is a layout without texels; give resident, the side of the sheet to stream onto")
+        if len(atlas.corner_uv) != len(self.sequence.faces):
+            raise ValueError(
+                f"atlas must be built for this sequence of {len(self.sequence.faces)} faces, "
+                f"got one of {len(atlas.corner_uv)}; use Atlas.build"
             )
-            self.shader.share_seen(material)
-            self._show = job(
-                gather.resolve_kernel,
-                pixels,
-                [pixel_triangle, pixels, _PIXELS, self.shader.radiance, self.background],
-                [blank, self._image.flatten()],
-            )
-        else:
-            if not isinstance(atlas, Atlas):
-                atlas = Atlas.build(self.sequence, atlas, progress=progress, device=self.device)
-            if len(atlas.corner_uv) != len(self.sequence.faces):
-                raise ValueError(
-                    f"atlas must be built for this sequence of {len(self.sequence.faces)} faces, "
-                    f"got one of {len(atlas.corner_uv)}; use Atlas.build"
-                )
-            self.atlas = atlas
-            side = atlas.resolution
-            owned = atlas.triangle >= 0
-            material = np.where(owned, face_material[np.maximum(atlas.triangle, 0)] + 1, 0)
-            if "unowned" not in self.skip:
-                material[~owned] = 1
-            self._face_texels = np.bincount(atlas.triangle[owned], minlength=len(self.sequence.faces))
-            self._owned = int(owned.sum())
-            triangle = wp.array(atlas.triangle, dtype=wp.int32, device=self.device)
-            material = wp.array(material.ravel(), dtype=wp.uint8, device=self.device)
-            corner_uv = wp.array(atlas.corner_uv.ravel(), dtype=wp.float32, device=self.device)
-            barycentric = wp.array(atlas.barycentric, dtype=wp.float32, device=self.device)
-            self.shader = self._shader(triangle, barycentric, material, atlas)
-            pixel = [pixel_triangle, pixel_barycentric, pixels, _PIXELS, corner_uv]
-            self._mark = job(worklist.mark_seen_kernel, pixels, [*pixel, side, side], [self.shader.seen])
-            self._mark_all = job(
-                worklist.mark_facing_kernel,
-                side * side,
-                [
-                    triangle.flatten(),
-                    material,
-                    self.mesh.side,
-                    int("backfacing" not in self.skip),
-                    side * side,
-                    _PIXELS,
-                ],
-                [self.shader.seen],
-            )
-            self._show = job(
-                gather.gather_kernel,
-                pixels,
-                [*pixel, self.shader.radiance, side, side, self.background],
-                [blank, self._image.flatten()],
-            )
-        self._since = 0
+        self.atlas = atlas
+        carried = policy.predicts if carry is None else bool(carry)
+        if carried and policy.holds_pose:
+            raise ValueError(f"{policy.name} shows an old pose's light; carry goes with every, staggered and adaptive")
+        needed = carried or policy.predicts
+        proxies = [proxy_of(m) for m in self.materials] if needed or share is not None else None
+        lod = sheet_lod(atlas, self.sequence, map_size)
 
-    def _shader(self, triangle, barycentric, material, atlas: Atlas | None = None) -> TexelShader:
-        lod = None
-        if atlas is not None and self._map_size is not None:
-            lod = atlas_lod(atlas.corner_uv, self.sequence.uv, self.sequence.faces, self._map_size)
-        return TexelShader(self.mesh, self.materials, triangle, barycentric, material, len(self.lights), lod)
+        def sheet():
+            if resident is None:
+                return Sheet(atlas, face_material, lod, unowned_too=not skips.unowned, device=self.device)
+            return StreamedSheet(atlas, resident, face_material, lod, device=self.device)
+
+        more = {"carried": carried, "seed": seed}
+        if not stereo:
+            self.view = TextureView(look, sheet(), policy, proxies, **more)
+        elif share is None:
+            left = sheet()
+            sheets = (left, left if resident is None else sheet())
+            self.view = texture_stereo(look, sheets, policy, proxies, 0.5 * self.eye_distance, **more)
+        else:
+            self.view = SharedStereoView(look, sheet(), policy, proxies, 0.5 * self.eye_distance, float(share), **more)
 
     def per_pixel(self) -> "Renderer":
-        """Return a renderer of the same shot that shades every pixel of every frame: the reference for this one."""
+        """Return a renderer of the same shot that shades every pixel of every frame: the reference for this one.
+
+        It has as many eyes as this one.
+        """
         return Renderer(
             self.sequence,
             self.assigned,
@@ -236,60 +229,43 @@ class Renderer:
             camera=self.camera,
             lights=self.lights,
             background=self.background,
+            gain=self.gain,
+            tonemap=self.tonemap,
+            stereo=self.stereo,
+            eye_distance=self.eye_distance,
             device=self.device,
         )
 
     def render(self, frames: Iterable[int] | None = None) -> Iterator[RenderedFrame]:
         """Yield the pictures of ``frames`` (default: the whole sequence), in order.
 
-        The first frame, and then every (interval + 1)th, shades anew all that it sees.
+        The first frame shades anew all that it sees.
         """
         self.restart()
         for index in range(self.sequence.frame_count) if frames is None else frames:
             frame = self.frame(index)
-            yield dataclasses.replace(frame, image=frame.image.copy())
+            right = None if frame.right is None else frame.right.copy()
+            yield dataclasses.replace(frame, image=frame.image.copy(), right=right)
 
     def restart(self) -> None:
         """Make the next frame start a new epoch, as the first one does."""
-        self._since = 0
+        if self.space == "texture":
+            self.view.restart()
 
     def frame(self, index: int) -> RenderedFrame:
         """Render frame ``index`` as the next picture.
 
         Its image is read-only and is overwritten by the next frame; :meth:`render` hands out copies.
         """
-        clock = _Clock(self.device)
-        camera = self.camera.at(index)
-        position, intensity = self.lights.at(index)
-        self.mesh.show(index)
-        updated = self.space == "screen" or self._since == 0
-        if updated:
-            self.mesh.freeze(camera.eye)
-            self.shader.begin(camera, position, intensity)
-        self._since = 0 if self._since == self.interval else self._since + 1
-        clock.stage("pose")
-        self.raster.run(self.mesh.shown, camera.clip())
-        clock.stage("visibility")
-        if self.space == "texture":
-            self.shader.seen.zero_()
-            if "unseen" not in self.skip and updated:
-                self._mark_all.run()
-        self._mark.run()
-        clock.stage("mark")
-        counts = self.shader.list()
-        clock.stage("list")
-        evaluations = self.shader.shade()
-        clock.stage("shade")
-        self._show.run()
-        image = self._image.numpy()
-        image.flags.writeable = False  # blocks that stay empty are not written again
-        clock.stage("gather")
-        texels = {"seen": counts.seen, "shaded": counts.shaded}
-        if self.space == "texture":
-            facing = int(self._face_texels[self.mesh.side.numpy() != 0].sum())
-            texels = {"owned": self._owned, "facing": facing, **texels}
+        clock = Clock(self.device)
+        camera, lights = self.camera.at(index), self.lights.at(index)
+        self._pose += self.mesh.show(index)
+        if self.space == "screen":
+            self.mesh.freeze()
+            stats = self.view.render(camera, lights, clock)
         else:
-            texels = {"owned": counts.seen, "facing": counts.seen, **texels}
-        return RenderedFrame(
-            index, image, {"ms": clock.ms, "texels": texels, "evaluations": evaluations, "updated": bool(updated)}
-        )
+            if self.view.begins_epoch() or not self.policy.holds_pose:
+                self.mesh.freeze()
+            stats = self.view.render(camera, lights, self._pose, clock)
+        right = self.view.right.image if self.stereo else None
+        return RenderedFrame(index, self.view.image, {"ms": clock.ms, **stats}, right)

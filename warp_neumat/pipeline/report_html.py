@@ -64,6 +64,23 @@ play.addEventListener("click", () => {
 show(0);
 """
 
+_NAMED = (
+    "sequence",
+    "animation",
+    "atlas",
+    "interval",
+    "policy",
+    "size",
+    "lights",
+    "device",
+    "operator",
+    "exposure",
+    "stereo",
+    "eye_distance",
+    "share",
+)
+"""Options that the head of the page names, where they are given."""
+
 _TEXELS = ("owned", "facing", "seen", "shaded")
 _WHY = {
     "facing": "turned to a camera",
@@ -110,9 +127,7 @@ def _header(report: dict) -> str:
     named = [
         f"{name} {'×'.join(map(str, value)) if name == 'size' and isinstance(value, list) else _text(value)}"
         for name, value in options.items()
-        if name
-        in ("sequence", "animation", "atlas", "interval", "policy", "size", "lights", "device", "operator", "exposure")
-        and value is not None
+        if name in _NAMED and value is not None and value is not False
     ]
     rows = [" · ".join(html.escape(str(item)) for item in row if item) for row in (named, where, made)]
     first, *rest = rows

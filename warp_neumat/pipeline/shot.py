@@ -57,7 +57,8 @@ def render_shot(
     """Render ``frames`` into the folder ``out`` and return the report.
 
     Written are ``frames/NNNN.png``, with ``exr`` also ``frames/NNNN.exr`` (linear, float16), with ``video``
-    ``video.mp4``, ``report.json`` and ``report.html``; with ``reference`` also ``reference/NNNN.png``.
+    ``video.mp4``, ``report.json`` and ``report.html``; with ``reference`` also ``reference/NNNN.png``. A renderer of
+    two eyes gives pictures of twice the width, the left eye's on the left; errors are then means over both.
 
     Args:
         renderer: What renders.
@@ -74,11 +75,13 @@ def render_shot(
     Raises:
         OSError: If the folder cannot be made or written.
         ImportError: If ``video`` or ``reference`` needs an extra that is not installed; nothing is rendered then.
-        ValueError: If there is no frame.
+        ValueError: If there is no frame, or the reference has another number of eyes.
     """
     if not len(frames):
         raise ValueError("there is no frame to render; give a range A:B with B above A")
     check_operator(operator, exposure)
+    if reference is not None and reference.stereo != renderer.stereo:
+        raise ValueError("reference must have as many eyes as the renderer; use Renderer.per_pixel")
     if reference is not None:  # a missing extra or too small a picture shows before the work
         blank = np.zeros((renderer.height, renderer.width, 3), np.float32)
         metrics.ssim(blank, blank)
@@ -87,7 +90,9 @@ def render_shot(
     _clear(out)
     if reference is not None:
         (out / "reference").mkdir(exist_ok=True)
-    writer = VideoWriter(out / "video.mp4", renderer.width, renderer.height, renderer.sequence.fps) if video else None
+    eyes = 2 if renderer.stereo else 1
+    width = eyes * renderer.width
+    writer = VideoWriter(out / "video.mp4", width, renderer.height, renderer.sequence.fps) if video else None
     entries, pictures = [], []
 
     def shoot(add: Callable[[np.ndarray], None]) -> None:
@@ -104,12 +109,13 @@ def render_shot(
                 stats["ms"][name] = 1e3 * (now - clock)  # noqa: B023  (called within the iteration)
                 clock = now
 
-            display = tonemap(frame.image, exposure, operator)
+            linear = np.hstack(frame.eyes)
+            display = tonemap(linear, exposure, operator)
             stage("tonemap")
             path = out / "frames" / f"{index:04d}.png"
             write_png(path, display)
             if exr:
-                write_exr(path.with_suffix(".exr"), frame.image)
+                write_exr(path.with_suffix(".exr"), linear)
             stage("write")
             add(display)
             stage("video")
@@ -119,13 +125,9 @@ def render_shot(
                 stats["reference"] = {"shade_ms": shaded.stats["ms"]["shade"]}
                 stats["reference"]["evaluations"] = shaded.stats["evaluations"]
                 clock = time.perf_counter()
-                expected = tonemap(shaded.image, exposure, operator)
+                expected = tonemap(np.hstack(shaded.eyes), exposure, operator)
                 write_png(out / "reference" / f"{index:04d}.png", expected)
-                stats["error"] = {
-                    "psnr": metrics.psnr(expected, display),
-                    "ssim": metrics.ssim(expected, display),
-                    "flip": metrics.flip(expected, display)[0],
-                }
+                stats["error"] = _error(expected, display, eyes)
                 stage("metrics")
             if writer is None:
                 del stats["ms"]["video"]
@@ -150,6 +152,20 @@ def render_shot(
     return write_report(out, report, frames=pictures)
 
 
+def _error(expected: np.ndarray, display: np.ndarray, eyes: int) -> dict:
+    """Return PSNR, SSIM and FLIP of a picture of so many eyes side by side: the means over them."""
+    pairs = [
+        tuple(np.ascontiguousarray(half) for half in pair)
+        for pair in zip(np.hsplit(expected, eyes), np.hsplit(display, eyes), strict=True)
+    ]
+    errors = {
+        "psnr": [metrics.psnr(*pair) for pair in pairs],
+        "ssim": [metrics.ssim(*pair) for pair in pairs],
+        "flip": [metrics.flip(*pair)[0] for pair in pairs],
+    }
+    return {name: float(np.mean(values)) for name, values in errors.items()}
+
+
 def _summary(renderer: Renderer, entries: list[dict]) -> dict:
     """Return what the report's own summary does not know: the atlas, and the gain over the reference."""
     summary: dict = {}
@@ -157,11 +173,20 @@ def _summary(renderer: Renderer, entries: list[dict]) -> dict:
         atlas = renderer.atlas
         summary["atlas"] = {
             "resolution": atlas.resolution,
-            "utilisation": atlas.utilisation,
-            "charts": atlas.chart_count,
+            "utilisation": getattr(atlas, "utilisation", None),  # a layout has no texels
+            "charts": int(atlas.chart.max()) + 1,
             "sources": atlas.sources,
             "notes": atlas.notes,
         }
+    if renderer.stereo:
+        summary["stereo"] = {
+            "eye_distance": renderer.eye_distance,
+            "pictures": "left and right eye side by side",
+            "numbers": "texels and evaluations are sums over both eyes, errors are means",
+        }
+        if "shared" in entries[0]:
+            names = entries[0]["shared"]
+            summary["shared"] = {n: sum(e["shared"][n] for e in entries) / len(entries) for n in names}
     if "reference" in entries[0]:
         ours = sum(e["ms"]["shade"] for e in entries)
         summary["reference_shade_ms"] = sum(e["reference"]["shade_ms"] for e in entries) / len(entries)

@@ -6,6 +6,7 @@ import warp as wp
 from warp_neumat.kernels import dispatch, worklist
 from warp_neumat.kernels.lod import uv_gradient_kernel
 from warp_neumat.materials.base import Material, load
+from warp_neumat.pipeline.camera import Camera
 from warp_neumat.pipeline.sequence import MeshSequence
 
 _FACES_PER_BLOCK = 4096
@@ -66,13 +67,13 @@ def map_sizes(sequence: MeshSequence, face_material: np.ndarray, materials: list
 class SurfaceMesh:
     """Device arrays of a sequence, updated in place.
 
-    :attr:`shown` are the points the camera sees; :attr:`points`, :attr:`normals`, :attr:`tangents` and :attr:`side` are
-    the pose that is shaded, which stays as it is while radiance is reused.
+    :attr:`shown` are the points the camera sees; :attr:`points`, :attr:`normals` and :attr:`tangents` are the pose that
+    is shaded, which may stay as it is while radiance is reused.
 
     Args:
         sequence: The mesh sequence.
         face_material: Material index of each face, shape (F,).
-        map_size: Of :func:`map_sizes`; None leaves :attr:`uv` and :attr:`uv_gradient` out.
+        map_size: Of :func:`map_sizes`; None leaves :attr:`uv` out.
         device: Warp device.
     """
 
@@ -91,50 +92,69 @@ class SurfaceMesh:
         self.shown = array((count, 3), wp.float32)
         self.points, self.normals = array((count, 3), wp.float32), array((count, 3), wp.float32)
         self.tangents = array((count, 4), wp.float32)
-        self.side = array(faces, wp.int8)
-        double = wp.array(sequence.face_double_sided.astype(np.uint8), dtype=wp.uint8, device=self.device)
+        self.double_sided = sequence.face_double_sided
         self._frame = self._shaded = None
-        self.uv = self.uv_gradient = None
-        self._facing = dispatch.Job(
-            worklist.facing_kernel,
-            dispatch.blocks(faces, _FACES_PER_BLOCK),
-            inputs=[self.faces, faces, double, self.points.flatten(), wp.vec3(), _FACES_PER_BLOCK],
-            outputs=[self.side],
-            device=self.device,
-        )
+        self.uv = self.map_size = None
         if map_size is not None:
             self.uv = wp.array(np.nan_to_num(sequence.uv), dtype=wp.float32, device=self.device)
-            self.uv_gradient = array(6 * faces, wp.float32)
-            size = wp.array(map_size.ravel(), dtype=wp.float32, device=self.device)
-            inputs = [self.faces, faces, size, self.uv.flatten(), self.points.flatten(), self.side, _FACES_PER_BLOCK]
-            self._gradient = dispatch.Job(
-                uv_gradient_kernel,
-                dispatch.blocks(faces, _FACES_PER_BLOCK),
-                inputs=inputs,
-                outputs=[self.uv_gradient],
-                device=self.device,
-            )
+            self.map_size = wp.array(map_size.ravel(), dtype=wp.float32, device=self.device)
 
-    def show(self, index: int) -> None:
-        """Move what the camera sees to frame ``index``."""
+    def show(self, index: int) -> bool:
+        """Move what the camera sees to frame ``index``; return whether that is another pose."""
         frame = self.sequence.frame(index)
-        if frame is not self._frame:
-            self._write(self.shown, frame.points)
-            self._frame = frame
+        if frame is self._frame:
+            return False
+        self._write(self.shown, frame.points)
+        self._frame = frame
+        return True
 
-    def freeze(self, eye) -> None:
-        """Take the shown frame as the pose that is shaded, and find which triangles face ``eye`` in it."""
+    def freeze(self) -> None:
+        """Take the shown frame as the pose that is shaded."""
         if self._frame is not self._shaded:
             for name in ("points", "normals", "tangents"):
                 self._write(getattr(self, name), getattr(self._frame, name))
             self._shaded = self._frame
-        self._facing.set(4, wp.vec3(*(float(c) for c in eye)))
-        self._facing.run()
-        if self.uv_gradient is not None:
-            self._gradient.run()
 
     def _write(self, target: wp.array, values: np.ndarray) -> None:
         if self.device.is_cpu:
             target.numpy()[...] = values  # a view: one copy, no allocation
         else:
             target.assign(values)
+
+
+class Facing:
+    """What of a mesh's shaded pose one eye may see.
+
+    Attributes:
+        side: Which side of each triangle it sees, int8: 1 front, −1 back of a double-sided one, 0 neither.
+        on_screen: Whether any of it may be in view, uint8.
+        uv_gradient: Of ``kernels.lod.uv_gradient_kernel``, for triangles that face it; None without textured materials.
+    """
+
+    def __init__(self, mesh: SurfaceMesh):
+        count, device = mesh.face_count, mesh.device
+        self.side = wp.zeros(count, dtype=wp.int8, device=device)
+        self.on_screen = wp.zeros(count, dtype=wp.uint8, device=device)
+        double = wp.array(mesh.double_sided.astype(np.uint8), dtype=wp.uint8, device=device)
+        blocks, points = dispatch.blocks(count, _FACES_PER_BLOCK), mesh.points.flatten()
+        self._facing = dispatch.Job(
+            worklist.facing_kernel,
+            blocks,
+            inputs=[mesh.faces, count, double, points, wp.vec3(), wp.mat44(), _FACES_PER_BLOCK],
+            outputs=[self.side, self.on_screen],
+            device=device,
+        )
+        self.uv_gradient = None
+        if mesh.uv is not None:
+            self.uv_gradient = wp.zeros(6 * count, dtype=wp.float32, device=device)
+            inputs = [mesh.faces, count, mesh.map_size, mesh.uv.flatten(), points, self.side, _FACES_PER_BLOCK]
+            outputs = [self.uv_gradient]
+            self._gradient = dispatch.Job(uv_gradient_kernel, blocks, inputs=inputs, outputs=outputs, device=device)
+
+    def update(self, camera: Camera) -> None:
+        """See the pose that is shaded through ``camera``."""
+        self._facing.set(4, wp.vec3(*(float(c) for c in camera.eye)))
+        self._facing.set(5, wp.mat44(camera.clip()))
+        self._facing.run()
+        if self.uv_gradient is not None:
+            self._gradient.run()
