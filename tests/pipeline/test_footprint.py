@@ -146,7 +146,8 @@ def test_texture_space_takes_the_coarser_of_atlas_and_picture(tmp_path):
     middle = np.s_[95:105, 95:105]
 
     def levels(camera, **options):
-        return Renderer(sheet, {"*": Probe(texels)}, size=size, camera=camera, lights=DARK, **options).frame(0).image
+        shot = {"size": size, "camera": camera, "lights": DARK, "policy": "every"}
+        return Renderer(sheet, {"*": Probe(texels)}, **shot, **options).frame(0).image
 
     coarse = Atlas.build(sheet, 64, cache=tmp_path)
     fine = Atlas.build(sheet, 1024, cache=tmp_path)

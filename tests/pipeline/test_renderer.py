@@ -83,7 +83,7 @@ LIGHTS = PointLights(
 
 
 def _renderer(sphere, material, **options):
-    shot = {"size": SIZE, "camera": Still((1.0, 1.5, 4.0)), "lights": LIGHTS} | options
+    shot = {"size": SIZE, "camera": Still((1.0, 1.5, 4.0)), "lights": LIGHTS, "policy": "fixed"} | options
     return Renderer(sphere, {"*": material}, **shot)
 
 

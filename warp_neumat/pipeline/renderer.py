@@ -111,7 +111,7 @@ class Renderer:
         camera: CameraPath | str = "orbit",
         lights: PointLights | int | str = 3,
         frame_count: int | None = None,
-        policy: Policy | str = "fixed",
+        policy: Policy | str = "adaptive",
         interval: int = 4,
         budget: float | None = None,
         milliseconds: float | None = None,

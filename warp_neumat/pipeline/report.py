@@ -30,7 +30,8 @@ ASIDE = ("reference", "metrics")
 FRAMES_EMBEDDED = 60
 WIDTH_EMBEDDED = 480
 
-_STAGES = ("pose", "visibility", "mark", "list", "shade", "gather", "tonemap", "write", "video")
+_STAGES = ("pose", "schedule", "visibility", "stream", "mark", "list", "shade", "gather", "probe")
+_STAGES += ("tonemap", "write", "video")
 
 
 def write_report(folder, report: dict, *, frames: list = ()) -> dict:
@@ -87,6 +88,9 @@ def summarise(entries: list[dict]) -> dict:
     texels = dict.fromkeys(name for entry in entries for name in entry.get("texels", {}))
     if texels:
         summary["texels"] = {n: statistics.fmean(e.get("texels", {}).get(n, 0) for e in entries) for n in texels}
+    left_out = dict.fromkeys(name for entry in entries for name in entry.get("skipped", {}))
+    if left_out:
+        summary["skipped"] = {n: statistics.fmean(e.get("skipped", {}).get(n, 0) for e in entries) for n in left_out}
     if any("evaluations" in entry for entry in entries):
         summary["evaluations"] = statistics.fmean(entry.get("evaluations", 0) for entry in entries)
     errors = [entry["error"] for entry in entries if entry.get("error")]

@@ -4,6 +4,7 @@ import html
 import json
 
 from .report_plots import PALETTE, Series, legend, lines, short, stacked
+from .skips import WHY
 
 _STYLE = """
 :root { --back: #fafafa; --card: #fff; --ink: #1c1e21; --dim: #63686e; --rule: #dcdfe3; --mark: #0072B2; }
@@ -105,7 +106,7 @@ def page(report: dict, pictures: list[tuple[int, str]], *, stages: list[str], as
     cards.append(_times(index, entries, shown))
     cards += _errors(index, entries)
     cards += _work(index, entries)
-    tables = [_stage_table(entries, summary, stages, aside), _skip_table(summary)]
+    tables = [_stage_table(entries, summary, stages, aside), _skip_table(summary), _left_out_table(summary)]
     return (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
@@ -269,7 +270,22 @@ def _skip_table(summary: dict) -> str:
     why = "; ".join(f"{name}: {_WHY[name]}" for name in names if name in _WHY)
     head = f"<th>texels</th><th>per frame</th><th>of {names[0]}</th><th>skip saves</th><th></th>"
     table = f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
-    return _card("What each skip saves", table, f"Owned: covered by a chart; {why}.")
+    return _card("From the atlas to what is shaded", table, f"Owned: covered by a chart; {why}.")
+
+
+def _left_out_table(summary: dict) -> str:
+    skipped = {name: count for name, count in (summary.get("skipped") or {}).items() if count}
+    if not skipped:
+        return ""
+    most = max(skipped.values())
+    rows = [
+        f"<tr><td>{name}</td><td>{short(count)}</td><td style='text-align:left'>{html.escape(WHY.get(name, ''))}</td>"
+        f"<td class='meter'><i style=\"width:{100 * count / most:.1f}%\"></i></td></tr>"
+        for name, count in skipped.items()
+    ]
+    head = "<th>skip</th><th>per frame</th><th style='text-align:left'>what is left out</th><th></th>"
+    table = f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
+    return _card("What each skip saves", table, "Texels; for range, spot and horizon evaluations.")
 
 
 def _facts(title: str, facts) -> str:
