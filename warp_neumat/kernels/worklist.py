@@ -191,6 +191,7 @@ _ROW = """
     int seen_texels = 0, shaded_texels = 0;
     for (int column = 0; column < columns; ++column) {
         const int tile = row * columns + column, x0 = 8 * column, wide = width - x0 < 8 ? width - x0 : 8;
+        if (fill && !tile_shaded.data[tile]) continue;
         unsigned long long marks[8], any = 0;
         for (int j = 0; j < high; ++j) {
             const unsigned char* from = seen.data + (long long)(y0 + j) * width + x0;

@@ -26,6 +26,7 @@ START_RATE = 1
 """Rate at which a tile is first shaded where the policy predicts, and its charts allow it."""
 
 _PER_BLOCK, _LEARNT = 1024, 16  # tiles, of the light kernels and of the learning one
+_GRAIN = 2048  # tiles worth a chunk of their own
 
 
 class Schedule:
@@ -80,10 +81,10 @@ class Schedule:
         self.slots = dispatch.worker_count()
         self.pixels = wp.zeros(self.slots * tiles, dtype=wp.int32, device=self._device)
 
-        def job(kernel, inputs, outputs, grain=1):
-            inputs = [self._listed, 1, *inputs]
-            options = {"device": self._device, "grain": grain, "slots": self.slots}
-            return dispatch.Job(kernel, 1, inputs=inputs, outputs=outputs, **options)
+        def job(kernel, inputs, outputs, per_block):
+            # A chunk costs some 25 µs to launch, as much as the work of a thousand tiles.
+            options = {"device": self._device, "grain": max(1, _GRAIN // per_block), "slots": self.slots}
+            return dispatch.Job(kernel, 1, inputs=[self._listed, 1, *inputs], outputs=outputs, **options)
 
         terms = [p.luminance_terms for p in proxies] if proxies else [(0.0, 0.0, 0.0, 1.0)] * len(shader.materials)
         table = wp.array(np.array(terms, np.float32).ravel(), dtype=wp.float32, device=self._device)
@@ -93,17 +94,17 @@ class Schedule:
         self._no_lights = make_lights(1, self._device)
         place = [self._sample, sheet.material, sheet.corner_uv, table]
         scene = [shader.surface, shader.lights, shader.viewer, gain, scratch]
-        self._predict = job(schedule.make_predict_kernel(lanes), [*place, *scene], [self._now, self._size])
+        self._predict = job(schedule.make_predict_kernel(lanes), [*place, *scene], [self._now, self._size], lanes)
         texture = [shader.width, shader.height, shader.rate, shader.done, shader.radiance]
         how = [self._now, gain, EPSILON / gain if carried else 0.0, _LEARNT]
-        self._learn = job(schedule.learn_kernel, [*texture, *how], [self._changed, self._roughness], grain=4)
+        self._learn = job(schedule.learn_kernel, [*texture, *how], [self._changed, self._roughness], _LEARNT)
         told = [self._now, self._then, self._size, self._shaded, self._follow, self._drift, self._rough]
         told += [self._smooth_rate, self._next_rate, shader.rate, shader.tile_seen, _PER_BLOCK]
         outputs = [self._size_rate, self._texels, self._whole, self._age, self._change, self._kept]
-        self._rank = job(tile_plan.rank_kernel, [0, int(unchanged), int(self._predicts), *told], outputs, grain=2)
+        self._rank = job(tile_plan.rank_kernel, [0, int(unchanged), int(self._predicts), *told], outputs, _PER_BLOCK)
         seen = [self._now, self._changed, self._roughness, self._smooth_rate, RATE_MAX if smooth else 0]
         outputs = [self._then, self._shaded, self._follow, self._drift, self._rough, self._next_rate]
-        self._settle = job(tile_plan.settle_kernel, [0, 0, *seen, 0.0, 0.0, _PER_BLOCK], outputs, grain=2)
+        self._settle = job(tile_plan.settle_kernel, [0, 0, *seen, 0.0, 0.0, _PER_BLOCK], outputs, _PER_BLOCK)
         self.reset()
 
     def _zeros(self, dtype=wp.float32) -> wp.array:

@@ -112,7 +112,10 @@ class TexelShader:
         self._quads = zeros(16 * self.tiles * min(4, kinds), wp.int32)
         common = [self.seen, texel_material, self.rate, self.due, self.width, self.height, self.rows, 0, self.done]
         common += [self._cursor, self._seen_count, self._shaded_count, self.tile_seen, self.tile_shaded, self._quads]
-        self._list_job = dispatch.Job(list_kernel, self.rows, common, device=self.device, grain=4)
+        # A chunk costs some 25 µs to launch, so there are few.
+        self._list_job = dispatch.Job(
+            list_kernel, self.rows, common, device=self.device, grain=max(4, dispatch.blocks(self.rows, 8))
+        )
 
         self.surface = Surface()
         self.surface.width = self.width

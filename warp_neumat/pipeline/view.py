@@ -50,7 +50,8 @@ class _View:
 
     def _job(self, kernel, count, inputs, outputs, per_block=_PIXELS, slots=None):
         blocks = dispatch.blocks(count, per_block)
-        return dispatch.Job(kernel, blocks, inputs=inputs, outputs=outputs, device=self.device, grain=2, slots=slots)
+        options = {"device": self.device, "grain": max(2, dispatch.blocks(blocks, 8)), "slots": slots}
+        return dispatch.Job(kernel, blocks, inputs=inputs, outputs=outputs, **options)
 
     def _blank(self, per_block=_PIXELS) -> wp.array:
         blocks = dispatch.blocks(self.width * self.height, per_block)
