@@ -151,7 +151,7 @@ def _bad(scene, **change):
         (lambda s: {"more": ("--budget", "9k", "--target-flip", "0.1")}, "budget and target_flip exclude each other"),
         (lambda s: {"more": ("--policy", "fixed", "--budget", "9k")}, "fixed keeps no budget; use the policy"),
         (lambda s: {"more": ("--share", "0.1")}, "share takes two eyes"),
-        (lambda s: {"more": ("--resident", "100")}, "side must be a multiple of 8"),
+        (lambda s: {"more": ("--resident", "100")}, "resident must be a multiple of 8"),
         (lambda s: {"more": ("--policy", "fixed", "--carry")}, "carry goes with every, staggered and adaptive"),
         (lambda s: {"more": ("--lights", "99")}, "lights must be 1 to 16"),
         (lambda s: {"more": ("--lights", s / "none.json")}, "none.json"),

@@ -13,7 +13,7 @@ TILES = 300
 @pytest.fixture
 def state(rng):
     """Return what is known of tiles; one in ten was never shaded."""
-    shaded = rng.integers(0, 20, TILES)
+    shaded = rng.integers(0, 21, TILES)
     shaded[::10] = NEVER
     return {
         "now": rng.random(TILES),
@@ -38,26 +38,27 @@ def _arrays(state, device):
 
 
 @pytest.mark.parametrize("skip", [0, 1])
-@pytest.mark.parametrize("predicts", [0, 1])
-def test_rank_matches_a_plain_loop(state, rng, device, skip, predicts):
+@pytest.mark.parametrize("predicts, minified", [(0, 1), (1, 1), (1, 0)])
+def test_rank_matches_a_plain_loop(state, rng, device, skip, predicts, minified):
     moved, listed = 20, rng.permutation(TILES)[:200].astype(np.int32)
     arrays = _arrays(state, device)
     size_rate = wp.zeros(TILES, dtype=wp.uint8, device=device)
     told = [wp.zeros(TILES, dtype=wp.float32, device=device) for _ in range(5)]
-    inputs = [wp.array(listed, device=device), len(listed), moved, skip, predicts, *arrays.values(), 64]
+    inputs = [wp.array(listed, device=device), len(listed), moved, skip, predicts, minified, *arrays.values(), 64]
     dispatch.launch(rank_kernel, 4, inputs=inputs, outputs=[size_rate, *told], device=device)
     texels, whole, age, change, kept = (a.numpy()[: len(listed)] for a in told)
     for i, t in enumerate(listed):
         s = {k: v[t].item() for k, v in state.items()}
-        since = 0 if s["shaded"] == NEVER else moved - s["shaded"] if skip else max(moved - s["shaded"], 1)
+        finer = s["next_rate"] < s["smooth_rate"]  # a refresh removes what the present rate loses
+        least = 0 if skip and not finer else 1
+        since = 0 if s["shaded"] == NEVER else max(moved - s["shaded"], least)
         left = 0.25 * max(s["rough"], 0) if s["smooth_rate"] else 0.0
         off = s["follow"] * abs(s["now"] - s["then"]) + s["drift"] * since + left if predicts and since > 0 else 0.0
         assert texels[i] == s["tile_seen"]
-        by_size = 2 if 0 < s["size"] <= STEP / 4 else 1 if 0 < s["size"] <= STEP / 2 else 0
+        by_size = minified * (2 if 0 < s["size"] <= STEP / 4 else 1 if 0 < s["size"] <= STEP / 2 else 0)
         assert whole[i] == min(s["tile_seen"] * 4 ** max(s["rate"] - by_size, 0), 64 / 4**by_size)
         assert age[i] == since
         assert change[i] == pytest.approx(off, abs=1e-6)
-        finer = s["next_rate"] < s["smooth_rate"]  # a refresh removes what the present rate loses
         assert kept[i] == pytest.approx(0.0 if finer else min(left, off), abs=1e-6)
         assert size_rate.numpy()[t] == by_size
 

@@ -92,11 +92,11 @@ def test_milliseconds_become_evaluations_by_what_frames_have_cost(rng, name):
     assert not policy.choose(tiles).any()  # nothing is known yet
     for _ in range(30):
         policy.learn(4.0, 20_000)  # 5000 evaluations a millisecond
-    assert 10_000 - 65 < tiles.cost[policy.choose(tiles)].sum() <= 10_000
+    assert 10_000 - 65 < tiles.cost[policy.choose(tiles)].sum() <= 10_000 + 64
     policy.learn(0.0, 0)  # a frame without shading tells nothing
     for _ in range(30):
         policy.learn(8.0, 20_000)
-    assert 5000 - 65 < tiles.cost[policy.choose(tiles)].sum() <= 5010  # the older frames still weigh a little
+    assert 5000 - 65 < tiles.cost[policy.choose(tiles)].sum() <= 5010 + 64  # the older frames still weigh a little
 
 
 @pytest.mark.parametrize("interval", [1, 4, 9])
@@ -110,8 +110,9 @@ def test_staggered_spreads_a_round_evenly_over_the_interval(rng, interval):
         waited = np.maximum(waited, age)
         age = np.where(due, 1, age + 1)
     share = tiles.whole / (interval + 1)
-    assert max(spent) <= share
-    assert min(spent) > share - 65  # but for one tile, which the budget has no room for
+    # But for one tile, which the budget has no room for, and pays for in the next frame.
+    assert max(spent) <= share + 64
+    assert min(spent) > share - 65
     # What those last tiles of the frames leave over comes one frame later.
     assert waited.max() <= interval + 2
     assert (waited <= interval + 1).mean() > 1 - 65 * (interval + 2) ** 2 / tiles.whole
@@ -158,7 +159,7 @@ def test_adaptive_with_a_target_refreshes_what_is_over_it(rng):
     tiles = _tiles(rng, 2000, age=np.full(2000, 3))
     error = flip_of(tiles.change, tiles.pixels)
     kept = []
-    for target in (0.0025, 0.01, 0.04, 10.0):
+    for target in (0.0025, 0.01, 0.04, 0.99):
         policy = make_policy("adaptive", 4, target_flip=target)
         due = policy.choose(tiles)
         left = error[~due].sum() / tiles.picture

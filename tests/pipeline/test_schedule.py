@@ -15,7 +15,7 @@ from warp_neumat.materials.base import Material, Shader
 from warp_neumat.materials.neubrdf import NeuBRDF
 from warp_neumat.pipeline.atlas import Atlas
 from warp_neumat.pipeline.lights import PointLights
-from warp_neumat.pipeline.policy import POLICIES
+from warp_neumat.pipeline.policy import POLICIES, make_policy
 from warp_neumat.pipeline.renderer import SKIPS, Renderer
 from warp_neumat.pipeline.sequence import MeshSequence
 from warp_neumat.pipeline.tonemap import tonemap
@@ -88,7 +88,8 @@ def test_no_texel_is_read_that_nobody_shaded(pair, material, atlas, policy, carr
 @pytest.mark.parametrize(("policy", "carry"), CARRIED)
 def test_a_still_scene_costs_nothing_and_stays(pair, material, atlas, policy, carry):
     renderer = _renderer(pair, material, atlas, policy, carry)
-    first = [renderer.frame(0) for _ in range(3)][-1]
+    # adaptive begins coarsely and needs some frames for every texel.
+    first = [renderer.frame(0) for _ in range(60 if policy == "adaptive" else 3)][-1]
     picture, stats = first.image.copy(), first.stats
     for _ in range(8):
         frame = renderer.frame(0)
@@ -286,3 +287,101 @@ def test_what_the_proxy_knows_is_carried_without_error(pair, atlas, policy):
     with_it, without = (np.concatenate(e) for e in zip(*errors, strict=True))
     assert np.quantile(without, 0.99) > 0.1 or policy == "every"
     assert with_it.max() < 2e-3  # seen: 4.4e-4, half an ulp of the float16 ratio
+
+
+class Cuts(Still):
+    """Looks away from the second frame on, and back from frame 13."""
+
+    def __init__(self):
+        super().__init__((1.0, 1.5, 6.0))
+        self._away = Still((1.0, 1.5, 6.0), target=(1.0, 1.5, 20.0)).at(0)
+
+    def at(self, frame):
+        return self._away if 1 <= frame < 13 else super().at(frame)
+
+
+@pytest.mark.parametrize("policy", ["staggered", "adaptive"])
+def test_what_comes_back_into_view_is_shaded_anew_when_it_is_old(pair, material, atlas, policy):
+    """After a cut back to what was seen long ago, the first picture is as good as new."""
+    static = MeshSequence.from_arrays(pair.frame(0).points, pair.faces, pair.uv)
+    shot = {"camera": Cuts(), "lights": Orbit(), "budget": 1.0, "skip": [s for s in SKIPS if s != "rate"]}
+    ours = _renderer(static, material, Atlas.build(static, 160, cache=False), policy, **shot)
+    del shot["budget"]
+    every = _renderer(static, material, ours.atlas, "every", **shot)
+    for k in (*range(13), 13):
+        frame, expected = ours.frame(k), every.frame(k)
+        if k == 1:
+            assert frame.image.max() == 0.0
+    assert np.array_equal(frame.image, expected.image)
+
+
+class Comes(Still):
+    """Moves until frame 6, and rests."""
+
+    def __init__(self):
+        super().__init__((1.0, 1.5, 6.0))
+
+    def at(self, frame):
+        angle = 0.1 * min(frame, 6)
+        return Still((6 * np.sin(angle), 1.5, 6 * np.cos(angle))).at(0)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"policy": "staggered", "budget": 300.0},
+        {"policy": "staggered", "budget": 20.0},  # less than a tile costs
+        {"policy": "adaptive", "budget": 300.0},
+        {"policy": "adaptive", "milliseconds": 0.05},
+        {"policy": "adaptive", "target_flip": 0.05},
+    ],
+)
+def test_what_comes_to_rest_ends_up_to_date(pair, material, atlas, options):
+    """Whatever the budget, a picture that has come to rest becomes the one that all-new shading gives, then is free."""
+    static = MeshSequence.from_arrays(pair.frame(0).points, pair.faces, pair.uv)
+    full = [s for s in SKIPS if s != "rate"]
+    ours, every = (
+        _renderer(static, material, Atlas.build(static, 160, cache=False), camera=Comes(), skip=full, **o)
+        for o in (options, {"policy": "every"})
+    )
+    tail = [ours.frame(min(k, 10)).stats["evaluations"] for k in range(900)][-10:]
+    for k in range(8):
+        expected = every.frame(k)
+    assert tail == [0] * 10
+    assert np.array_equal(ours.frame(10).image, expected.image)
+
+
+def test_a_still_scene_under_adaptive_reaches_the_rates_it_wants(pair, material, atlas):
+    static = MeshSequence.from_arrays(pair.frame(0).points, pair.faces, pair.uv)
+    ours, reference = (
+        _renderer(
+            static, material, atlas, p, p == "adaptive", size=(194, 122), camera=Still((1.0, 1.5, 6.0), size=(194, 122))
+        )
+        for p in ("adaptive", "every")
+    )
+    screen = reference.per_pixel().frame(0).image
+    for k in range(40):
+        frame = ours.frame(0)
+    every = metrics.flip(tonemap(screen), tonemap(reference.frame(0).image))[0]
+    assert metrics.flip(tonemap(screen), tonemap(frame.image))[0] < 1.25 * every + 2e-3
+    assert frame.stats["evaluations"] == 0
+
+
+def test_rates_off_means_every_texel_under_adaptive_too(pair, material, atlas):
+    far = _renderer(pair, material, atlas, "adaptive", True, camera=Still((0, 0, 40.0)), skip=set(SKIPS) - {"rate"})
+    for k in range(3):
+        frame = far.frame(k)
+    assert frame.stats["skipped"]["rate"] == 0
+    assert not far.view.shader.rate.numpy().any()
+
+
+def test_a_policy_may_be_used_by_several_renderers(pair, material, atlas):
+    policy = make_policy("adaptive", 2, target_flip=0.01)
+    first = _renderer(pair, material, atlas, policy)
+    first.frame(0)
+    noted = first.policy.target.mean
+    second = _renderer(pair, material, atlas, policy)
+    assert second.policy is not first.policy
+    assert first.policy.target.mean == noted
+    with pytest.raises(ValueError, match="budget is for policies by name"):
+        _renderer(pair, material, atlas, policy, budget=5.0)

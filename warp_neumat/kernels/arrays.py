@@ -86,3 +86,11 @@ def _scalar_view(array: wp.array) -> wp.array:
     view = wp.array(ptr=array.ptr, shape=(*array.shape, size), dtype=array.dtype._wp_scalar_type_, device=array.device)
     view._ref = array  # the view borrows the memory
     return view
+
+
+def write(target: wp.array, values) -> None:
+    """Overwrite a Warp array with numpy values of its shape, or one number; on the CPU without an allocation."""
+    if target.device.is_cpu:
+        target.numpy()[...] = values
+    else:
+        target.assign(np.broadcast_to(np.asarray(values), target.shape))

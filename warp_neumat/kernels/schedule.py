@@ -84,7 +84,10 @@ def make_predict_kernel(lanes: int):
         now: wp.array(dtype=wp.float32),
         size: wp.array(dtype=wp.float32),
     ):
-        """Write √Y of the proxy and the size of a texel [px] of the listed tiles; 0 for tiles without a sample."""
+        """Write √Y of the proxy and the size of a texel [px] of the listed tiles.
+
+        Of a tile without a sample √Y is 0, and its size is left as it was.
+        """
         b = first + wp.tid()
         own = scratch.ptr + wp.uint64(slot) * wp.uint64(STRIDE) * FLOAT
         if wp.static(L == 1):

@@ -28,6 +28,7 @@ def rank_kernel(
     moved: int,
     skip_unchanged: int,
     predicts: int,
+    minified: int,
     now: wp.array(dtype=wp.float32),
     then: wp.array(dtype=wp.float32),
     size: wp.array(dtype=wp.float32),
@@ -51,16 +52,17 @@ def rank_kernel(
     """Write, for each of the listed tiles in turn, what the policy is told of it.
 
     ``texels`` it shows, and would show were it not shaded coarsely for being smooth (``whole``); frames since it was
-    shaded in which something moved (``age``, at least 1 unless ``skip_unchanged``, 0 for one that was never shaded),
-    the predicted ``change`` since, and what of it refreshing would leave (``kept``). ``size_rate`` [tile] is the rate
-    that its texels' size on the picture allows: a step is at most :data:`STEP` pixels.
+    shaded in which something moved (``age``, 0 for one that was never shaded; at least 1 for one that waits for a finer
+    rate, and without ``skip_unchanged``), the predicted ``change`` since, and what of it refreshing would leave
+    (``kept``). ``size_rate`` [tile] is the rate that its texels' size on the picture allows, if ``minified``: a step is
+    at most :data:`STEP` pixels.
     """
     b = first + wp.tid()
     for i in range(b * per_block, wp.min((b + 1) * per_block, count)):
         t = listed[i]
         s = size[t]
         r = int(0)
-        if s > 0.0 and s <= STEP / 2.0:
+        if minified != 0 and s > 0.0 and s <= STEP / 2.0:
             r = wp.where(s <= STEP / 4.0, 2, 1)
         size_rate[t] = wp.uint8(r)
         n = float(tile_seen[t])
@@ -70,7 +72,7 @@ def rank_kernel(
         since = moved - shaded[t]
         if shaded[t] == NEVER:
             since = 0
-        elif skip_unchanged == 0:
+        elif skip_unchanged == 0 or next_rate[t] < smooth_rate[t]:
             since = wp.max(since, 1)
         age[i] = float(since)
         left = float(0.0)

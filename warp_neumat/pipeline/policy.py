@@ -13,11 +13,12 @@ picture read are due. What is read and was never shaded is shaded in any case, b
 
   with the change that is predicted since they were shaded (``schedule.py``), in √Y; the exponent is about FLIP's for a
   colour difference, 0.7 (Andersson et al. 2020, Sec. 4.1.2). It takes as many as the budget allows, or as must be for a
-  mean FLIP (``target.py``). A tile as young as ``age_min`` waits, one as old as ``age_max`` comes first.
+  mean FLIP (``target.py``). A tile younger than ``age_min`` waits; one far older than ``age_max`` comes first.
 """
 
 import abc
 import dataclasses
+import numbers
 import operator
 
 import numpy as np
@@ -124,12 +125,28 @@ class Budget:
     def __init__(self, evaluations: float | None = None, milliseconds: float | None = None, share: float = 1.0):
         self.evaluations, self.milliseconds, self.share = evaluations, milliseconds, share
         self._rate: float | None = None  # evaluations a millisecond
+        self._saved = 0.0
 
     def learn(self, milliseconds: float, evaluations: int) -> None:
         """Take note of what a frame's shading cost."""
         if milliseconds > 0 and evaluations > 0:
             rate = evaluations / milliseconds
             self._rate = rate if self._rate is None else 0.8 * self._rate + 0.2 * rate
+
+    def choose(self, value: np.ndarray, tiles: Tiles) -> np.ndarray:
+        """Return the tiles of largest ``value`` that can be paid; what is left over is kept for the next frame.
+
+        It is kept up to the price of one tile, so that the dearest has its turn even under the smallest budget.
+        """
+        left = self.left(tiles)
+        chosen = affordable(value, tiles.cost, left) & (value > 0)
+        rest = left - float(tiles.cost[chosen].sum())
+        self._saved = min(rest, float(tiles.cost.max(initial=0.0)))
+        return chosen
+
+    def reset(self) -> None:
+        """Begin anew, with nothing kept."""
+        self._saved, self._rate = 0.0, None
 
     def left(self, tiles: Tiles) -> float:
         """Return the evaluations that remain for refreshing ``tiles`` once the new texels are paid."""
@@ -139,7 +156,7 @@ class Budget:
             whole = self.milliseconds * self._rate if self._rate else 0.0
         else:
             whole = self.share * tiles.whole
-        return max(0.0, whole - tiles.new)
+        return max(0.0, whole + self._saved - tiles.new)
 
 
 class Staggered(Policy):
@@ -151,10 +168,13 @@ class Staggered(Policy):
         self.budget = budget
 
     def choose(self, tiles: Tiles) -> np.ndarray:
-        return affordable(tiles.age + tiles.tie, tiles.cost, self.budget.left(tiles))
+        return self.budget.choose(np.where(tiles.age > 0, tiles.age + tiles.tie, 0.0), tiles)
 
     def learn(self, milliseconds: float, evaluations: int) -> None:
         self.budget.learn(milliseconds, evaluations)
+
+    def reset(self) -> None:
+        self.budget.reset()
 
 
 class Adaptive(Policy):
@@ -182,7 +202,9 @@ class Adaptive(Policy):
         late = tiles.age >= self.age_max * (0.5 + tiles.tie)  # not all that began together at once
         value[late] += _LATE
         if self.target is None:
-            return affordable(value, tiles.cost, self.budget.left(tiles)) & (value > 0)
+            return self.budget.choose(value, tiles)
+        if not tiles.moved:
+            return affordable(value, tiles.cost, _AT_REST * tiles.whole) & (value > 0)
         excess = float(error.sum()) / tiles.picture - self.target.allowance()
         return late | (needed(value, error / tiles.picture, excess) & (value > 0))
 
@@ -191,11 +213,11 @@ class Adaptive(Policy):
             self.budget.learn(milliseconds, evaluations)
 
     def reset(self) -> None:
-        if self.target is not None:
-            self.target.reset()
+        (self.target or self.budget).reset()
 
 
 _LATE = 1e6  # value of a tile that may not wait
+_AT_REST = 0.25  # share of what is seen that is mended a frame, where a target is held and nothing moves
 
 
 def flip_of(change: np.ndarray, pixels) -> np.ndarray:
@@ -279,8 +301,10 @@ def make_policy(name: str, interval: int, *, budget=None, milliseconds=None, tar
     if target_flip is not None and name != "adaptive":
         raise ValueError(f"{name} aims for no target_flip; use the policy adaptive")
     for key in given:
-        if not 0 < limits[key] < float("inf"):
+        if not isinstance(limits[key], numbers.Real) or not 0 < limits[key] < float("inf"):
             raise ValueError(f"{key} must be a positive number, got {limits[key]!r}")
+    if target_flip is not None and target_flip >= 1:
+        raise ValueError(f"target_flip must be below 1, which FLIP never exceeds, got {target_flip!r}")
     if name == "every":
         return Every()
     if name == "fixed":

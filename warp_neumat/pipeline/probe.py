@@ -61,7 +61,6 @@ class Probe:
             gain=look.gain,
         )
         self._shader.share_seen(self._material)
-        self._corner_uv = None
         self._seed = seed
         self.reset()
 

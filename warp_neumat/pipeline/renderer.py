@@ -11,12 +11,16 @@ In stereo, all that holds for each of two eyes (``pipeline/stereo.py``).
 In screen space, the same shading kernel runs on the camera raster itself, every pixel of every frame: the reference.
 """
 
+import copy
 import dataclasses
+import math
+import numbers
 from collections.abc import Iterable, Iterator
 
 import numpy as np
 import warp as wp
 
+from warp_neumat.kernels.tiles import TILE
 from warp_neumat.materials.proxy import proxy_of
 from warp_neumat.pipeline.atlas import Atlas, AtlasLayout
 from warp_neumat.pipeline.camera import CameraPath, bounding_sphere, load_camera
@@ -29,7 +33,7 @@ from warp_neumat.pipeline.sheet import Sheet, StreamedSheet, sheet_lod
 from warp_neumat.pipeline.skips import SKIPS, Skips
 from warp_neumat.pipeline.stereo import SharedStereoView, eye_distance_of, screen_stereo, texture_stereo
 from warp_neumat.pipeline.surface_mesh import SurfaceMesh, bind_materials, map_sizes, open_materials
-from warp_neumat.pipeline.tonemap import check_operator
+from warp_neumat.pipeline.tonemap import OPERATORS
 from warp_neumat.pipeline.view import ScreenView, TextureView
 
 __all__ = ["POLICIES", "SIDE_MAX", "SKIPS", "RenderedFrame", "Renderer"]
@@ -134,17 +138,38 @@ class Renderer:
             raise ValueError(f"size must be 1 to {SIDE_MAX} pixels each way, got {size[0]}x{size[1]}")
         for name, value in (("eye_distance", eye_distance), ("share", share)):
             if value is not None and not stereo:
-                raise ValueError(f"{name} takes two eyes; give stereo=True too")
+                raise ValueError(f"{name} takes two eyes; give stereo too")
         if share is not None and not 0 <= share <= 1:
             raise ValueError(f"share must be a difference in [0, 1], got {share!r}")
         if share is not None and space == "screen":
             raise ValueError('share takes textures; leave it out, or use space="texture"')
         if share is not None and getattr(policy, "target", target_flip) is not None:
             raise ValueError("share and target_flip exclude each other; give a budget")
+        limits = {"budget": budget, "milliseconds": milliseconds, "target_flip": target_flip}
+        limits = {name: value for name, value in limits.items() if value is not None}
+        only_texture = [*limits, *(n for n, v in (("resident", resident), ("carry", carry)) if v is not None)]
+        if only_texture and space == "screen":
+            raise ValueError(f'{only_texture[0]} is for textures; leave it out, or use space="texture"')
         skips = Skips.named(skip)
-        if not isinstance(policy, Policy):
-            limits = {"budget": budget, "milliseconds": milliseconds, "target_flip": target_flip}
+        if isinstance(policy, Policy):
+            if limits:
+                raise ValueError(f"{next(iter(limits))} is for policies by name; give it to the policy itself")
+            policy = copy.deepcopy(policy)  # it learns, and others may use it too
+        else:
             policy = make_policy(policy, interval, **limits)
+        carried = policy.predicts if carry is None else bool(carry)
+        if carried and policy.holds_pose:
+            raise ValueError(f"{policy.name} shows an old pose's light; carry goes with every, staggered and adaptive")
+        if resident is not None and not (16 <= resident <= SIDE_MAX and resident % TILE == 0):
+            raise ValueError(f"resident must be a multiple of {TILE} in 16 … {SIDE_MAX} texels, got {resident!r}")
+        if not 0 < gain < math.inf:
+            raise ValueError(f"gain must be a positive number, got {gain!r}")
+        if not isinstance(seed, numbers.Integral) or seed < 0:
+            raise ValueError(f"seed must be a whole number of at least 0, got {seed!r}")
+        if len(background) != 3:
+            raise ValueError(f"background must be three values, got {len(background)}")
+        if tonemap not in OPERATORS:
+            raise ValueError(f"tonemap must be one of {', '.join(OPERATORS)}, got {tonemap!r}")
         self.device, self.space, self.policy = wp.get_device(device), space, policy
         self.sequence = sequence if isinstance(sequence, MeshSequence) else MeshSequence.load(sequence)
         self.assigned = open_materials(materials, device=self.device)
@@ -163,7 +188,6 @@ class Renderer:
         self.camera, self.stereo = camera, bool(stereo)
         self.eye_distance = eye_distance_of(eye_distance, first, *bounding_sphere(lo, hi)) if stereo else None
         self.lights = lights if isinstance(lights, PointLights) else lights_from(lights, lo, hi, frame_count)
-        check_operator(tonemap, 0.0)
         self.background, self.gain, self.tonemap = tuple(float(c) for c in background), float(gain), tonemap
 
         map_size = map_sizes(self.sequence, face_material, self.materials)
@@ -194,9 +218,6 @@ class Renderer:
                 f"got one of {len(atlas.corner_uv)}; use Atlas.build"
             )
         self.atlas = atlas
-        carried = policy.predicts if carry is None else bool(carry)
-        if carried and policy.holds_pose:
-            raise ValueError(f"{policy.name} shows an old pose's light; carry goes with every, staggered and adaptive")
         needed = carried or policy.predicts
         proxies = [proxy_of(m) for m in self.materials] if needed or share is not None else None
         lod = sheet_lod(atlas, self.sequence, map_size)

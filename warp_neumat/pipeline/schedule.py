@@ -7,13 +7,15 @@ For every tile it is remembered when it was shaded, what √Y its proxy had then
 - *rough*: what its anchors differ from lying on straight lines, so how much a coarser rate would lose. Halving the
   step quarters that.
 
-The age of a tile counts frames in which something moved. In a still scene nothing ages, changes or is due.
+The age of a tile counts frames in which something moved. In a still scene nothing ages; what is stale is mended, what
+is shaded coarsely becomes finer, and then nothing is due.
 """
 
 import numpy as np
 import warp as wp
 
 from warp_neumat.kernels import dispatch, schedule, tile_plan
+from warp_neumat.kernels.arrays import write
 from warp_neumat.kernels.carry import EPSILON
 from warp_neumat.kernels.shade import make_lights
 from warp_neumat.kernels.tiles import RATE_MAX, TILE
@@ -21,6 +23,9 @@ from warp_neumat.materials.proxy import Proxy
 from warp_neumat.pipeline.policy import Policy, Tiles
 from warp_neumat.pipeline.sheet import Sheet
 from warp_neumat.pipeline.texel_shader import TexelShader
+
+RETURNED = 12
+"""Age [frames] from which a tile that comes back into view is shaded anew at once, as if it were new."""
 
 START_RATE = 1
 """Rate at which a tile is first shaded where the policy predicts, and its charts allow it."""
@@ -48,6 +53,8 @@ class Schedule:
         slots: Workers that may count pixels.
         pixels: Pixels of the last picture that read each tile, [worker][tile], int32, on the device.
         change: Predicted change of each tile in the present picture, once the due ones are shaded [√Y].
+        pending: Whether a tile that is not up to date was left for a later frame.
+        unchanged_texels: Texels read by the last picture for which nothing has moved since they were shaded.
     """
 
     def __init__(
@@ -101,7 +108,9 @@ class Schedule:
         told = [self._now, self._then, self._size, self._shaded, self._follow, self._drift, self._rough]
         told += [self._smooth_rate, self._next_rate, shader.rate, shader.tile_seen, _PER_BLOCK]
         outputs = [self._size_rate, self._texels, self._whole, self._age, self._change, self._kept]
-        self._rank = job(tile_plan.rank_kernel, [0, int(unchanged), int(self._predicts), *told], outputs, _PER_BLOCK)
+        self._rank = job(
+            tile_plan.rank_kernel, [0, int(unchanged), int(self._predicts), int(minified), *told], outputs, _PER_BLOCK
+        )
         seen = [self._now, self._changed, self._roughness, self._smooth_rate, RATE_MAX if smooth else 0]
         outputs = [self._then, self._shaded, self._follow, self._drift, self._rough, self._next_rate]
         self._settle = job(tile_plan.settle_kernel, [0, 0, *seen, 0.0, 0.0, _PER_BLOCK], outputs, _PER_BLOCK)
@@ -117,11 +126,12 @@ class Schedule:
         self._new = 0.0  # evaluations of the last frame that were for texels seen for the first time
         self._due = np.zeros(0, np.int32)
         self._mean_follow, self._mean_drift = (0.5 if self._carried else 1.0), 0.0
-        self.unchanged_texels = 0  # seen, of tiles that nothing has moved for
+        self.unchanged_texels, self.pending = 0, False
         self.change = np.zeros(self.shader.tiles, np.float32)
         for array in (self._then, self._follow, self._drift, self._size_rate, self.pixels):
             array.zero_()
         self.blank(slice(None))
+        write(self._sample, self.sheet.sample)
         self.policy.reset()
 
     def blank(self, tiles) -> None:
@@ -135,19 +145,25 @@ class Schedule:
             (self._rough, schedule.UNKNOWN),
             (self._smooth_rate, START_RATE if self._smooth else 0),
             (self._next_rate, START_RATE if self._smooth else 0),
+            (self._size_rate, 0),
         ):
             values = array.numpy()
             values[tiles] = value
-            _write(array, values)
+            write(array, values)
         self._set_rates()
 
     def void(self, rectangles) -> None:
         """Forget what is known of the tiles in ``rectangles`` (x, y, width, height) [texel], which hold others now."""
-        void = np.zeros((self.shader.rows, self.shader.columns), bool)
+        self.blank(self.tiles_of(rectangles))
+        self._due = self._due[self._shaded.numpy()[self._due] != tile_plan.NEVER]
+        write(self._sample, self.sheet.sample)
+
+    def tiles_of(self, rectangles) -> np.ndarray:
+        """Return the numbers of the tiles in ``rectangles`` (x, y, width, height) [texel], ascending."""
+        inside = np.zeros((self.shader.rows, self.shader.columns), bool)
         for x, y, width, height in rectangles:
-            void[y // TILE : -(-(y + height) // TILE), x // TILE : -(-(x + width) // TILE)] = True
-        self.blank(np.flatnonzero(void))
-        _write(self._sample, self.sheet.sample)
+            inside[y // TILE : -(-(y + height) // TILE), x // TILE : -(-(x + width) // TILE)] = True
+        return np.flatnonzero(inside)
 
     def plan(self, moved: bool) -> None:
         """Decide which tiles are due and set the rates, by what the last frame saw.
@@ -159,12 +175,22 @@ class Schedule:
         pixels = self.pixels.numpy().reshape(-1, self.shader.tiles)
         pixels = pixels[0] + pixels[1] if len(pixels) == 2 else pixels.sum(axis=0, dtype=np.int32)
         # A tile may be read through the right and lower texels of footprints alone, and then counts no pixel.
-        seen = np.flatnonzero((pixels > 0) | (self.shader.tile_seen.numpy() > 0))
-        due = np.zeros(self.shader.tiles, np.uint8)
-        self._due = seen[:0]
-        if len(seen):
+        known = (pixels > 0) | (self.shader.tile_seen.numpy() > 0)
+        seen = np.flatnonzero(known)
+        shaded = self._shaded.numpy()
+        due = (~known & (shaded > tile_plan.NEVER) & (shaded < self._moved - RETURNED)).astype(np.uint8)
+        self.unchanged_texels, self.pending = 0, False
+        size_rate = self._size_rate.numpy()
+        write(self._size_rate, np.where(known, size_rate, 0))  # what is not read has no size
+        if not len(seen):
+            self._new = 0.0
+        else:
             if self._predicts or self._minified:
                 self._run_predict(seen)
+            if self._smooth and not moved:  # at rest there is time for every texel
+                wanted = self._next_rate.numpy()
+                wanted[seen] = np.maximum(self._smooth_rate.numpy()[seen], 1) - 1
+                write(self._next_rate, wanted)
             self._rank.set(2, self._moved)
             self._run(self._rank, seen, _PER_BLOCK)
             count = len(seen)
@@ -173,24 +199,26 @@ class Schedule:
             cost = self._per_texel * texels
             share = np.maximum(pixels[seen], 1).astype(np.float32)
             kept = self._kept.numpy()[:count]
-            tiles = Tiles(seen, share, cost, age, change - kept, self._new, whole, self.picture, moved, self._tie[seen])
+            new = self._new if moved else 0.0  # a still picture shows nothing new
+            tiles = Tiles(seen, share, cost, age, change - kept, new, whole, self.picture, moved, self._tie[seen])
             chosen = self.policy.choose(tiles) & (age > 0)
-            self._due = seen[chosen]
-            due[self._due] = 1
-            self.unchanged_texels = int(texels[age == 0].sum())
+            due[seen[chosen]] = 1
+            self.unchanged_texels = int(texels[(age == 0) & (shaded[seen] != tile_plan.NEVER)].sum())
+            self.pending = self.policy.keeps and bool((~chosen & (age > 0)).any())
             if self._predicts:
                 self.change[:] = 0.0
                 self.change[seen] = np.where(chosen, kept, change)
-            if self._smooth:
-                rate = self._smooth_rate.numpy()
-                rate[self._due] = self._next_rate.numpy()[self._due]
-                _write(self._smooth_rate, rate)
-        _write(self.shader.due, due)
+        self._due = np.flatnonzero(due)
+        if self._smooth:
+            rate = self._smooth_rate.numpy()
+            rate[self._due] = self._next_rate.numpy()[self._due]
+            write(self._smooth_rate, rate)
+        write(self.shader.due, due)
         self._set_rates()
 
     def _set_rates(self) -> None:
         rate = np.maximum(self._smooth_rate.numpy(), self._size_rate.numpy())
-        _write(self.shader.rate, np.minimum(rate, self.sheet.limit))
+        write(self.shader.rate, np.minimum(rate, self.sheet.limit))
 
     def learn(self, evaluations: int, texels: int, milliseconds: float) -> None:
         """Take note of what the frame has shaded.
@@ -237,10 +265,3 @@ class Schedule:
             self._listed[: len(tiles)].assign(tiles.astype(np.int32))
         job.set(1, len(tiles))
         job.run(dispatch.blocks(len(tiles), per_block))
-
-
-def _write(target: wp.array, values: np.ndarray) -> None:
-    if target.device.is_cpu:
-        target.numpy()[...] = values
-    else:
-        target.assign(values)

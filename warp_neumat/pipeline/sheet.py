@@ -63,6 +63,9 @@ class Sheet:
     def stats(self) -> None:
         """Nothing streams."""
 
+    def restart(self) -> None:
+        """Be as before the first frame: it never is otherwise."""
+
 
 class StreamedSheet:
     """The charts of a layout that are seen; attributes as of :class:`Sheet`.
@@ -87,10 +90,18 @@ class StreamedSheet:
         self._chart = np.asarray(layout.chart)
         edges = np.diff(np.asarray(layout.corner_uv, np.float64), axis=1)
         self._area = 0.5 * np.abs(edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0])
+        self._blank()
+
+    def _blank(self) -> None:
+        grid = tile_count(self.side, self.side)[::-1]
         self.face_texels = np.zeros(len(self._area), np.int64)
-        self._grid = tile_count(side, side)[::-1]
-        self._limit, self._sample = np.zeros(self._grid, np.uint8), np.full(self._grid, -1, np.int32)
-        self._owned = np.zeros(self._grid, np.int16)
+        self._limit, self._sample = np.zeros(grid, np.uint8), np.full(grid, -1, np.int32)
+        self._owned = np.zeros(grid, np.int16)
+
+    def restart(self) -> None:
+        """Hold no chart, as before the first frame."""
+        self._streaming.reset()
+        self._blank()
 
     @property
     def limit(self) -> np.ndarray:

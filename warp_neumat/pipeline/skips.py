@@ -45,6 +45,8 @@ class Skips:
 
         Raises: ValueError: If a name is unknown.
         """
+        if isinstance(names, str):
+            raise ValueError(f"skip must be names in a list, as ['rate'], got {names!r}")
         names = set(names)
         unknown = names - set(SKIPS)
         if unknown:

@@ -27,6 +27,7 @@ import numpy as np
 import warp as wp
 
 from warp_neumat.kernels import dispatch, stereo
+from warp_neumat.kernels.arrays import write
 from warp_neumat.kernels.tiles import TILE
 from warp_neumat.materials.proxy import Proxy
 from warp_neumat.pipeline.camera import Camera, CameraPath
@@ -216,6 +217,7 @@ class SharedStereoView(StereoView):
         """Make the next frame start a new epoch, as the first one does."""
         super().restart()
         self.middle.restart()
+        self._samples = quadrant_samples(self._sheet.triangle.numpy())
         # Begun as shared, so that what is judged first need only be within the tolerance.
         self.shared = (self._samples >= 0).any(axis=1).astype(np.uint8)
         self._frame = 0
@@ -249,6 +251,10 @@ class SharedStereoView(StereoView):
             self._samples = quadrant_samples(self._sheet.triangle.numpy())
             for texture in self._textures:
                 texture.void(changed)
+            tiles = self.middle.schedule.tiles_of(changed)  # of other charts: judged from the next frame on
+            self.shared[tiles] = (self._samples[tiles] >= 0).any(axis=1)
+            write(self._shared, self.shared)
+            self._unify_rates()
         clock.stage("stream")
         self.middle.shader.seen.zero_()
         self.middle.schedule.pixels.zero_()
@@ -284,7 +290,7 @@ class SharedStereoView(StereoView):
                 mine = changed[self.shared[changed] == (texture is self.middle)]
                 if len(mine):
                     self._clear(texture, mine)
-        _assign(self._shared, self.shared)
+        write(self._shared, self.shared)
 
     def _differences(self, tiles, cameras) -> np.ndarray:
         """Return what the eyes differ in, of each of ``tiles``, so far as it counts [√Y]."""
@@ -297,7 +303,7 @@ class SharedStereoView(StereoView):
         for k, camera in zip((7, 8), cameras, strict=False):
             differ.set(k, wp.vec3(*map(float, camera.eye)))
         differ.run(dispatch.blocks(len(listed), dispatch.lanes(self._listed.device)))
-        difference = self._difference.numpy()[: len(listed)].reshape(len(tiles), -1)
+        difference = self._difference.numpy()[: len(listed)].reshape(self._samples[tiles].shape)
         return self._scale * np.where(self._samples[tiles] >= 0, difference, 0.0).max(axis=1)
 
     def _clear(self, texture: RadianceTexture, tiles) -> None:
@@ -318,7 +324,7 @@ class SharedStereoView(StereoView):
         """Give shared tiles the middle's rate in both eyes, whose marking and gathering read it."""
         ours = self.middle.shader.rate.numpy()
         for view in (self.left, self.right):
-            _assign(view.shader.rate, np.where(self.shared > 0, ours, view.shader.rate.numpy()))
+            write(view.shader.rate, np.where(self.shared > 0, ours, view.shader.rate.numpy()))
 
     def _statistics(self) -> dict:
         *eyes, middle = (texture.statistics() for texture in self._textures)
@@ -399,10 +405,3 @@ def quadrant_samples(triangle: np.ndarray) -> np.ndarray:
     y = TILE * (tile // columns) + half * (quadrant // 2) + nearest // half
     x = TILE * (tile % columns) + half * (quadrant % 2) + nearest % half
     return np.where(cells.any(axis=2), y * width + x, -1).astype(np.int32)
-
-
-def _assign(target: wp.array, values: np.ndarray) -> None:
-    if target.device.is_cpu:
-        target.numpy()[...] = values
-    else:
-        target.assign(values)

@@ -147,6 +147,20 @@ class StreamingAtlas:
         self._workers, self._samples, self._jobs = 0, None, {}
         self.stats: StreamingStats | None = None
 
+    def reset(self) -> None:
+        """Hold nothing, as before the first update."""
+        self._residency = _Residency(self._residency.size, self.side // TILE)
+        for values, blank in (
+            *[(self._fineness, 0), (self._average, 0), (self._before, 0), (self._held, -1)],
+            *[(self.chart_map, -1), (self._tile_chart, -1)],
+        ):
+            values[...] = blank
+        self.triangle.fill_(-1)
+        self.material.zero_()
+        self.corner_uv.fill_(1.0)
+        wp.copy(self.least_lod, self._base_lod)
+        self.stats = None
+
     @property
     def bytes(self) -> int:
         """Memory held [byte]: a texel takes 13 on the device and 4 on the host, a face some 90 in all, a chart 200."""

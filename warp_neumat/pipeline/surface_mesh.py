@@ -4,6 +4,7 @@ import numpy as np
 import warp as wp
 
 from warp_neumat.kernels import dispatch, worklist
+from warp_neumat.kernels.arrays import write
 from warp_neumat.kernels.lod import uv_gradient_kernel
 from warp_neumat.materials.base import Material, load
 from warp_neumat.pipeline.camera import Camera
@@ -104,7 +105,7 @@ class SurfaceMesh:
         frame = self.sequence.frame(index)
         if frame is self._frame:
             return False
-        self._write(self.shown, frame.points)
+        write(self.shown, frame.points)
         self._frame = frame
         return True
 
@@ -112,14 +113,8 @@ class SurfaceMesh:
         """Take the shown frame as the pose that is shaded."""
         if self._frame is not self._shaded:
             for name in ("points", "normals", "tangents"):
-                self._write(getattr(self, name), getattr(self._frame, name))
+                write(getattr(self, name), getattr(self._frame, name))
             self._shaded = self._frame
-
-    def _write(self, target: wp.array, values: np.ndarray) -> None:
-        if self.device.is_cpu:
-            target.numpy()[...] = values  # a view: one copy, no allocation
-        else:
-            target.assign(values)
 
 
 class Facing:

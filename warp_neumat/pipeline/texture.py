@@ -157,7 +157,7 @@ class RadianceTexture:
         clock.stage("shade")
         self.schedule.learn(self._shaded.evaluations, self._counts.shaded, clock.ms["shade"] - before)
         clock.stage("schedule")
-        self._still = not self._counts.shaded and not self._moved
+        self._still = not self._counts.shaded and not self._moved and not self.schedule.pending
 
     def void(self, rectangles) -> None:
         """Forget what was shaded in ``rectangles`` (x, y, width, height) [texel] of the sheet."""
@@ -203,4 +203,5 @@ def unshaded(last: dict) -> dict:
     """Return the statistics of a frame that is the one of ``last`` over again."""
     texels = {**last["texels"], "shaded": 0}
     skipped = {**dict.fromkeys(last["skipped"], 0), "unchanged": texels["seen"]}
+    last = {name: value for name, value in last.items() if name != "probe"}
     return {**last, "texels": texels, "skipped": skipped, "evaluations": 0, "updated": False}

@@ -163,6 +163,7 @@ class TextureView(_View):
 
     def restart(self) -> None:
         """Make the next frame start a new epoch, as the first one does."""
+        self.sheet.restart()
         self.texture.restart()
         if self.probe is not None:
             self.probe.reset()
