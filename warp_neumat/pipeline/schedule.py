@@ -31,7 +31,7 @@ START_RATE = 1
 """Rate at which a tile is first shaded where the policy predicts, and its charts allow it."""
 
 _PER_BLOCK, _LEARNT = 1024, 16  # tiles, of the light kernels and of the learning one
-_GRAIN = 2048  # tiles worth a chunk of their own
+_GRAIN = 8192  # tiles worth a chunk of their own
 
 
 class Schedule:
@@ -89,7 +89,7 @@ class Schedule:
         self.pixels = wp.zeros(self.slots * tiles, dtype=wp.int32, device=self._device)
 
         def job(kernel, inputs, outputs, per_block):
-            # A chunk costs some 25 µs to launch, as much as the work of a thousand tiles.
+            # A second worker costs more to wake and to feed than a few thousand tiles take.
             options = {"device": self._device, "grain": max(1, _GRAIN // per_block), "slots": self.slots}
             return dispatch.Job(kernel, 1, inputs=[self._listed, 1, *inputs], outputs=outputs, **options)
 
