@@ -360,7 +360,7 @@ def test_a_still_scene_under_adaptive_reaches_the_rates_it_wants(pair, material,
         for p in ("adaptive", "every")
     )
     screen = reference.per_pixel().frame(0).image
-    for k in range(40):
+    for _ in range(40):
         frame = ours.frame(0)
     every = metrics.flip(tonemap(screen), tonemap(reference.frame(0).image))[0]
     assert metrics.flip(tonemap(screen), tonemap(frame.image))[0] < 1.25 * every + 2e-3

@@ -17,7 +17,7 @@ from warp_neumat.pipeline.lights import PointLights
 from warp_neumat.pipeline.renderer import Renderer
 from warp_neumat.pipeline.sequence import MeshSequence
 from warp_neumat.pipeline.shot import render_shot
-from warp_neumat.pipeline.stereo import EyePath, quadrant_samples
+from warp_neumat.pipeline.stereo import quadrant_samples
 from warp_neumat.pipeline.tonemap import tonemap
 
 SIZE = (193, 121)  # odd, so that the last tiles are cut
@@ -25,6 +25,17 @@ SIZE = (193, 121)  # odd, so that the last tiles are cut
 LIGHTS = PointLights(
     np.array([[2.0, 3.0, 2.0], [-3.0, 1.0, 1.0], [0.0, -4.0, 2.0]]), np.array([[30.0, 28, 25], [8, 10, 14], [3, 5, 3]])
 )
+
+
+class EyePath(CameraPath):
+    """A camera path, ``offset`` [scene unit] to the right of another."""
+
+    def __init__(self, path: CameraPath, offset: float):
+        self.path, self.offset = path, offset
+
+    def at(self, frame: float) -> Camera:
+        """Return the camera of ``frame``."""
+        return self.path.at(frame).moved(self.offset)
 
 
 class Turning(CameraPath):

@@ -101,7 +101,7 @@ def test_tiles_that_are_due_may_be_replaced(balls, material, layout):
 
 def test_a_film_is_the_same_again(balls, material, layout):
     streamed = _renderer(balls, material, layout, resident=SHEET, policy="adaptive")
-    first, again = ([frame for frame in streamed.render(range(10))] for _ in range(2))
+    first, again = (list(streamed.render(range(10))) for _ in range(2))
     for one, other in zip(first, again, strict=True):
         assert one.stats["evaluations"] == other.stats["evaluations"]
         assert np.array_equal(one.image, other.image)

@@ -116,10 +116,15 @@ class Probe:
         for _ in range(64):  # cheaper than listing all that are drawn
             y, x = self._random.integers(height), self._random.integers(width)
             if triangle[y, x] >= 0:
-                top = min(max(y - WINDOW // 2, 0), max(height - WINDOW, 0))
-                left = min(max(x - WINDOW // 2, 0), max(width - WINDOW, 0))
-                return slice(top, top + WINDOW), slice(left, left + WINDOW)
-        return None
+                break
+        else:
+            drawn = np.flatnonzero(triangle >= 0)
+            if not len(drawn):
+                return None
+            y, x = divmod(int(self._random.choice(drawn)), width)
+        top = min(max(y - WINDOW // 2, 0), max(height - WINDOW, 0))
+        left = min(max(x - WINDOW // 2, 0), max(width - WINDOW, 0))
+        return slice(top, top + WINDOW), slice(left, left + WINDOW)
 
     def _tiles(self, triangle, barycentric, corner_uv) -> np.ndarray:
         b1, b2 = barycentric.T

@@ -30,7 +30,7 @@ from warp_neumat.kernels import dispatch, stereo
 from warp_neumat.kernels.arrays import write
 from warp_neumat.kernels.tiles import TILE
 from warp_neumat.materials.proxy import Proxy
-from warp_neumat.pipeline.camera import Camera, CameraPath
+from warp_neumat.pipeline.camera import Camera
 from warp_neumat.pipeline.clock import Clock
 from warp_neumat.pipeline.lights import LightState
 from warp_neumat.pipeline.look import Look
@@ -66,17 +66,6 @@ def eye_distance_of(distance: float | None, camera: Camera, centre: np.ndarray, 
     if not 0 < distance < float("inf"):
         raise ValueError(f"eye distance must be a positive number of scene units, got {distance!r}")
     return float(distance)
-
-
-class EyePath(CameraPath):
-    """A camera path, ``offset`` [scene unit] to the right of another."""
-
-    def __init__(self, path: CameraPath, offset: float):
-        self.path, self.offset = path, offset
-
-    def at(self, frame: float) -> Camera:
-        """Return the camera of ``frame``."""
-        return self.path.at(frame).moved(self.offset)
 
 
 class StereoView:
