@@ -38,7 +38,7 @@ def _arrays(state, device):
 
 
 @pytest.mark.parametrize("skip", [0, 1])
-@pytest.mark.parametrize("predicts, minified", [(0, 1), (1, 1), (1, 0)])
+@pytest.mark.parametrize(("predicts", "minified"), [(0, 1), (1, 1), (1, 0)])
 def test_rank_matches_a_plain_loop(state, rng, device, skip, predicts, minified):
     moved, listed = 20, rng.permutation(TILES)[:200].astype(np.int32)
     arrays = _arrays(state, device)
