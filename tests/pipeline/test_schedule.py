@@ -142,7 +142,7 @@ def test_a_budget_holds_but_for_what_comes_into_view(pair, material, atlas, poli
     renderer = _renderer(still, material, atlas, policy, lights=Orbit(), budget=whole / 4)
     spent = [renderer.frame(k).stats["evaluations"] for k in range(16)][4:]
     # Costs are estimates: evaluations by texel of the frames before.
-    assert max(spent) < 1.15 * whole / 4
+    assert max(spent) < 1.25 * whole / 4
     assert np.mean(spent) > 0.5 * whole / 4
 
 

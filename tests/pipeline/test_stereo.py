@@ -214,7 +214,7 @@ def test_sharing_saves_evaluations_for_little(make, references, request, look, p
         assert stats["shared"]["texels"] > 500
     # What both eyes see is as before: sharing changes who shades it.
     seen = [film[0][1]["texels"]["seen"] for film in (apart, shared)]
-    assert seen[0] == seen[1]
+    assert seen[0] == pytest.approx(seen[1], rel=0.01)  # shared tiles have the rate of the viewer midway
 
 
 def test_shared_tiles_are_shaded_for_a_viewer_midway(make):

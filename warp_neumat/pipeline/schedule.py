@@ -180,10 +180,9 @@ class Schedule:
         shaded = self._shaded.numpy()
         due = (~known & (shaded > tile_plan.NEVER) & (shaded < self._moved - RETURNED)).astype(np.uint8)
         self.unchanged_texels, self.pending = 0, False
-        size_rate = self._size_rate.numpy()
-        write(self._size_rate, np.where(known, size_rate, 0))  # what is not read has no size
         if not len(seen):
             self._new = 0.0
+            self._measure_all()
         else:
             if self._predicts or self._minified:
                 self._run_predict(seen)
@@ -193,6 +192,9 @@ class Schedule:
                 write(self._next_rate, wanted)
             self._rank.set(2, self._moved)
             self._run(self._rank, seen, _PER_BLOCK)
+            # What comes into view is guessed to be like most of what was, but rather finer, as the present camera sees it.
+            rate = self._size_rate.numpy()
+            write(self._size_rate, np.where(known, rate, np.partition(rate[seen], len(seen) // 4)[len(seen) // 4]))
             count = len(seen)
             texels, age, change = (a.numpy()[:count] for a in (self._texels, self._age, self._change))
             whole = self._per_texel * float(self._whole.numpy()[:count].sum())
@@ -215,6 +217,17 @@ class Schedule:
             write(self._smooth_rate, rate)
         write(self.shader.due, due)
         self._set_rates()
+
+    def _measure_all(self) -> None:
+        """Set the rates by the size of the texels of all tiles: where the last picture says nothing of the next."""
+        self._size_rate.zero_()
+        tiles = np.flatnonzero(self.sheet.sample >= 0)
+        if self._minified and len(tiles):
+            self._run_predict(tiles)
+            size, rate = self._size.numpy()[tiles], self._size_rate.numpy()
+            step = float(tile_plan.STEP)
+            rate[tiles] = (size > 0) * ((size <= step / 2).astype(np.uint8) + (size <= step / 4))
+            write(self._size_rate, rate)
 
     def _set_rates(self) -> None:
         rate = np.maximum(self._smooth_rate.numpy(), self._size_rate.numpy())
