@@ -192,7 +192,7 @@ class Schedule:
                 write(self._next_rate, wanted)
             self._rank.set(2, self._moved)
             self._run(self._rank, seen, _PER_BLOCK)
-            # What comes into view is guessed to be like most of what was, but rather finer, as the present camera sees it.
+            # What comes into view is guessed to be like what was seen, as the present camera sees it, but rather finer.
             rate = self._size_rate.numpy()
             write(self._size_rate, np.where(known, rate, np.partition(rate[seen], len(seen) // 4)[len(seen) // 4]))
             count = len(seen)
