@@ -1,5 +1,6 @@
 """A whole shot on disk: frames, video, reference and report."""
 
+import math
 import re
 import time
 from collections.abc import Callable
@@ -13,7 +14,7 @@ from warp_neumat.io.image import write_exr, write_png
 from warp_neumat.io.video import VideoWriter
 from warp_neumat.pipeline.renderer import Renderer
 from warp_neumat.pipeline.report import write_report
-from warp_neumat.pipeline.tonemap import check_operator, tonemap
+from warp_neumat.pipeline.tonemap import tonemap
 
 
 def prepare_folder(out) -> Path:
@@ -46,8 +47,6 @@ def render_shot(
     frames: range,
     *,
     reference: Renderer | None = None,
-    exposure: float = 0.0,
-    operator: str = "srgb",
     exr: bool = False,
     video: bool = False,
     options: dict | None = None,
@@ -61,13 +60,11 @@ def render_shot(
     two eyes gives pictures of twice the width, the left eye's on the left; errors are then means over both.
 
     Args:
-        renderer: What renders.
+        renderer: What renders; its gain and tone mapping are those of the pictures.
         out: Folder, made where it is missing.
         frames: Frame numbers.
         reference: Renders the same frames in screen space; the error of each frame is measured against it on the
             tone-mapped pictures: PSNR, SSIM, FLIP.
-        exposure: Gain before tone mapping [stops].
-        operator: Tone mapping, as :func:`tonemap` names it.
         options: What the report says was asked for.
         setup: Milliseconds of what came before the first frame, by name, for the report.
         progress: Called as ``progress(fraction, text)``.
@@ -79,7 +76,7 @@ def render_shot(
     """
     if not len(frames):
         raise ValueError("there is no frame to render; give a range A:B with B above A")
-    check_operator(operator, exposure)
+    exposure, operator = math.log2(renderer.gain), renderer.tonemap
     if reference is not None and reference.stereo != renderer.stereo:
         raise ValueError("reference must have as many eyes as the renderer; use Renderer.per_pixel")
     if reference is not None:  # a missing extra or too small a picture shows before the work
