@@ -11,7 +11,7 @@ from warp_neumat.kernels.bc6h_tables import MODES
 from warp_neumat.materials.bcf import BCf
 from warp_neumat.pipeline.atlas import Atlas
 from warp_neumat.pipeline.lights import PointLights
-from warp_neumat.pipeline.renderer import Renderer
+from warp_neumat.pipeline.renderer import SKIPS, Renderer
 from warp_neumat.pipeline.sequence import MeshSequence
 from warp_neumat.reference import shade as reference
 from warp_neumat.reference.ggx import ggx
@@ -224,14 +224,15 @@ def test_six_materials_dress_the_flight_helmet(data, tmp_path):
     for seed, name in enumerate(helmet.material_names):
         paths[name] = tmp_path / f"{name}.neumat"
         fake_bcf(paths[name], seed=seed, channels=12, size=256, features=(128, 64, 32, 16))
-    renderer = Renderer(helmet, paths, atlas=512, size=(160, 120), lights=2, policy="every")
+    shot = {"atlas": 512, "size": (160, 120), "lights": 2, "policy": "every", "skip": set(SKIPS) - {"rate"}}
+    renderer = Renderer(helmet, paths, **shot)
     frame = renderer.frame(0)
     assert len(renderer.materials) == 6
     assert len({job._arguments[0].maps.texels.ptr for job in renderer.view.shader._jobs}) == 1
     assert np.isfinite(frame.image).all()
     screen = renderer.per_pixel().frame(0).image
     assert screen.max() > 0.1
-    assert np.abs(frame.image - screen).mean() < 0.12 * screen.mean()  # the maps are noise, read at up to 1.5 pixels
+    assert np.abs(frame.image - screen).mean() < 0.1 * screen.mean()
 
 
 def test_eval_is_the_brdf_of_the_finest_maps(material, rng):
