@@ -19,9 +19,6 @@ from warp_neumat.kernels.shade import Lights, Surface, Viewer, raised_view
 
 wp.set_module_options(dispatch.module_options())
 
-PROXY_WORDS = 4
-"""Numbers of a material's luminance proxy: diffuse, specular, grazing, α²."""
-
 UNKNOWN = -1.0
 """What :func:`learn_kernel` writes where a tile has nothing to learn from."""
 

@@ -296,10 +296,10 @@ def make_policy(name: str, interval: int, *, budget=None, milliseconds=None, tar
     given = [key for key, value in limits.items() if value is not None]
     if len(given) > 1:
         raise ValueError(f"{given[0]} and {given[1]} exclude each other; give one")
-    if given and name in ("every", "fixed"):
-        raise ValueError(f"{name} keeps no {given[0]}; use the policy staggered or adaptive")
     if target_flip is not None and name != "adaptive":
         raise ValueError(f"{name} aims for no target_flip; use the policy adaptive")
+    if given and name in ("every", "fixed"):
+        raise ValueError(f"{name} keeps no {given[0]}; use the policy staggered or adaptive")
     for key in given:
         if not isinstance(limits[key], numbers.Real) or not 0 < limits[key] < float("inf"):
             raise ValueError(f"{key} must be a positive number, got {limits[key]!r}")

@@ -150,20 +150,22 @@ def sheet_lod(atlas: Atlas | AtlasLayout, sequence, map_size: np.ndarray | None)
     return None if map_size is None else atlas_lod(atlas.corner_uv, sequence.uv, sequence.faces, map_size)
 
 
-def samples(triangle: np.ndarray) -> np.ndarray:
-    """Return the texel of each tile that is owned and nearest to its middle, −1 = none; int32, (rows, columns).
+def samples(triangle: np.ndarray, cell: int = TILE) -> np.ndarray:
+    """Return the texel of each cell that is owned and nearest to its middle, −1 = none; int32, (rows, columns).
 
     Args:
         triangle: Owner of each texel, −1 = none, shape (height, width).
+        cell: Side of a cell [texel]; those of whole tiles are counted, also where the last tiles are cut.
     """
     height, width = triangle.shape
-    columns, rows = tile_count(width, height)
-    owned = np.zeros((rows * TILE, columns * TILE), bool)
+    columns, rows = (n * TILE // cell for n in tile_count(width, height))
+    owned = np.zeros((rows * cell, columns * cell), bool)
     owned[:height, :width] = triangle >= 0
-    cells = owned.reshape(rows, TILE, columns, TILE).transpose(0, 2, 1, 3).reshape(rows, columns, TILE * TILE)
-    j, i = np.divmod(np.arange(TILE * TILE), TILE)
-    order = np.argsort((i - 3.4) ** 2 + (j - 3.4) ** 2, kind="stable")
+    cells = owned.reshape(rows, cell, columns, cell).transpose(0, 2, 1, 3).reshape(rows, columns, cell * cell)
+    j, i = np.divmod(np.arange(cell * cell), cell)
+    middle = 0.5 * cell - 0.6  # a little off, so that none of the four in the middle are equals
+    order = np.argsort((i - middle) ** 2 + (j - middle) ** 2, kind="stable")
     nearest = order[np.argmax(cells[..., order], axis=2)]
-    y = TILE * np.arange(rows)[:, None] + nearest // TILE
-    x = TILE * np.arange(columns)[None, :] + nearest % TILE
+    y = cell * np.arange(rows)[:, None] + nearest // cell
+    x = cell * np.arange(columns)[None, :] + nearest % cell
     return np.where(cells.any(axis=2), y * width + x, -1).astype(np.int32)

@@ -35,6 +35,7 @@ from warp_neumat.pipeline.clock import Clock
 from warp_neumat.pipeline.lights import LightState
 from warp_neumat.pipeline.look import Look
 from warp_neumat.pipeline.policy import Policy
+from warp_neumat.pipeline.sheet import samples
 from warp_neumat.pipeline.texture import RadianceTexture, unshaded
 from warp_neumat.pipeline.view import ScreenView, TextureView
 
@@ -382,15 +383,6 @@ def quadrant_samples(triangle: np.ndarray) -> np.ndarray:
     Args:
         triangle: Owner of each texel, −1 = none, shape (height, width).
     """
-    height, width = triangle.shape
-    rows, columns, half = -(-height // TILE), -(-width // TILE), TILE // 2
-    owned = np.zeros((rows * TILE, columns * TILE), bool)
-    owned[:height, :width] = triangle >= 0
-    cells = owned.reshape(rows, 2, half, columns, 2, half).transpose(0, 3, 1, 4, 2, 5).reshape(-1, 4, half * half)
-    j, i = np.divmod(np.arange(half * half), half)
-    order = np.argsort((i - 1.4) ** 2 + (j - 1.4) ** 2, kind="stable")
-    nearest = order[np.argmax(cells[..., order], axis=2)]
-    tile, quadrant = np.arange(rows * columns)[:, None], np.arange(4)[None]
-    y = TILE * (tile // columns) + half * (quadrant // 2) + nearest // half
-    x = TILE * (tile % columns) + half * (quadrant % 2) + nearest % half
-    return np.where(cells.any(axis=2), y * width + x, -1).astype(np.int32)
+    quarters = samples(triangle, TILE // 2)
+    rows, columns = (n // 2 for n in quarters.shape)
+    return quarters.reshape(rows, 2, columns, 2).transpose(0, 2, 1, 3).reshape(-1, 4)
