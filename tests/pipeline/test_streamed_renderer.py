@@ -93,10 +93,17 @@ def test_a_layout_needs_a_sheet(balls, material, layout):
 
 
 def test_tiles_that_are_due_may_be_replaced(balls, material, layout):
-    """A sheet that is too small, and all that is seen due in every frame: charts leave while their tiles are due."""
-    streamed = _renderer(balls, material, layout, resident=96, policy="staggered", interval=0, camera=Inside())
-    coarser = [streamed.frame(2 * k).stats["charts"]["coarser"] for k in range(20)]
-    assert max(coarser) > 0
+    """All that is seen is due, and then other charts lie there: no tile is both due and new."""
+    streamed = _renderer(balls, material, layout, resident=SHEET, policy="staggered", interval=0)
+    for k in range(3):
+        streamed.frame(k)
+    schedule = streamed.view.schedule
+    schedule.plan(True)
+    due = np.flatnonzero(schedule.shader.due.numpy())
+    assert len(due) > 50
+    schedule.void([(0, 0, SHEET, SHEET // 2)])
+    below = due[due >= schedule.shader.tiles // 2]
+    assert np.array_equal(schedule._due, below)
 
 
 def test_a_film_is_the_same_again(balls, material, layout):
