@@ -1,10 +1,12 @@
 """Assets with random contents, for tests of what a material computes rather than of how well it was fitted."""
 
+import copy
 import zlib
 
 import numpy as np
 
 from warp_neumat.io.asset import KINDS, pack_bits, write_asset
+from warp_neumat.io.block_formats import BlockTexture, mip_shape
 from warp_neumat.kernels.bc6h_tables import MODES
 
 
@@ -136,7 +138,8 @@ def random_bcf(
     width, height = pair(size)
     config = {
         "textures": textures, "signed": signed, "hidden": hidden, "width": width, "height": height, "wrap": wrap,
-        "channels": CHANNELS[:channels], "constants": {"specular": [0.5]} if constants is None else constants,
+        "channels": copy.deepcopy(CHANNELS[:channels]),
+        "constants": {"specular": [0.5]} if constants is None else constants,
     }  # fmt: skip
     return tensors, {"kind": "bcf", "version": 1, "config": config}
 
@@ -199,3 +202,108 @@ def random_btf(
                 blocks = random_blocks(rng, rows * columns, signed=True, modes=(10,))
                 tensors[f"{name}.block{t}.mip{m}"] = blocks.reshape(rows, columns, 16)
     return tensors, {"kind": "btf", "version": 1, "config": config}
+
+
+def random_block_maps(rng, width, height, *, wrap="repeat"):
+    """Return (textures, sources, config) of ``BlockMaps`` with nine channels of random blocks in BC1, BC5, BC7, BC4.
+
+    The nine are the first of :data:`CHANNELS`, displacement with its range, so that every encoding occurs.
+    """
+    mips = max(width, height).bit_length()
+
+    def texture(format):
+        levels = [rng.integers(0, 256, mip_shape(format, width, height, m), dtype=np.uint8) for m in range(mips)]
+        if format.startswith("bc7"):  # a first byte of 0 is reserved
+            for level in levels:
+                level[..., 0] |= 0x40
+        return BlockTexture(format, width, height, [levels])
+
+    textures = [texture("bc1_srgb"), texture("bc5_unorm"), texture("bc7_unorm"), texture("bc4_unorm")]
+    sources = [(0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (2, 1), (2, 0), (2, 3), (3, 0)]
+    config = {"width": width, "height": height, "wrap": wrap, "channels": copy.deepcopy(CHANNELS[:9])}
+    return textures, sources, {**config, "constants": {"specular": [0.5]}}
+
+
+NTBC_TEXTURES = {
+    "bc1": [
+        {"name": "base_color", "format": "bc1_srgb", "planes": [{"format": "bc1", "channels": [0, 1, 2]}]},
+        {"name": "normal", "format": "bc5_unorm", "planes": [{"format": "bc4", "channels": [k]} for k in (3, 4)]},
+        {"name": "roughness", "format": "bc4_unorm", "planes": [{"format": "bc4", "channels": [5]}]},
+        {"name": "metallic", "format": "bc4_unorm", "planes": [{"format": "bc4", "channels": [6]}]},
+    ],
+    "bc7": [
+        {"name": "base_color", "format": "bc7_srgb", "planes": [{"format": "bc7", "channels": [0, 1, 2]}]},
+        {
+            "name": "rest",
+            "format": "bc3_unorm",
+            "planes": [{"format": "bc1", "channels": [5]}, {"format": "bc4", "channels": [6]}],
+        },
+        {"name": "normal", "format": "bc1_unorm", "planes": [{"format": "bc1", "channels": [3, 4]}]},
+    ],
+}
+"""Textures of :func:`random_ntbc`: what a fit makes by default, and one of everything else."""
+
+
+def random_ntbc(
+    rng,
+    *,
+    size=64,
+    wrap="repeat",
+    textures="bc1",
+    mode="conservative",
+    variant="ntbc",
+    endpoints="network",
+    metric="rgb",
+    hidden=(16, 16, 16),
+    levels=((4, 4), (8, 8), (16, 16)),
+    bits=8,
+):
+    """Return (tensors, header) of an NTBC of seven channels whose colours and endpoints vary around 1/2.
+
+    Args:
+        rng: Generator.
+        size: Side of the textures, or (width, height).
+        wrap, mode, variant, endpoints, metric, hidden: As in the config.
+        textures: A key of :data:`NTBC_TEXTURES`.
+        levels: Sizes of the grids of each network.
+        bits: Of each of their two features.
+    """
+    width, height = (size, size) if isinstance(size, int) else size
+    listed = copy.deepcopy(NTBC_TEXTURES[textures])
+    planes = [(t, p, plane) for t, texture in enumerate(listed) for p, plane in enumerate(texture["planes"])]
+    colours = [plane for plane in planes if plane[2]["format"] != "bc4"]
+    single = [plane for plane in planes if plane[2]["format"] == "bc4"]
+    models, tensors = [], {}
+    for i, served in enumerate([colours, single] if mode == "conservative" else [planes]):
+        components = sum(3 if p["format"] == "bc1" else len(p["channels"]) for _, _, p in served)
+        outputs = {"endpoint": 2 * components, "texel": len(served) if variant == "naive" else components}
+        model = {"planes": [[t, p] for t, p, _ in served], "endpoint": None, "texel": None}
+        for network in ("endpoint", "texel")[endpoints == "fitted" :]:
+            name, model[network] = (
+                f"model{i}.{network}",
+                {"levels": [list(level) for level in levels], "features": 2, "bits": bits},
+            )
+            for n, (w, h) in enumerate(levels):
+                codes = rng.integers(0, 1 << bits, (h, w, 2), dtype=np.uint8)
+                tensors[f"{name}.grid{n}"] = pack_bits(codes, bits)
+            half = 1 << (bits - 1)
+            tensors[f"{name}.scale"] = (rng.uniform(0.8, 1.6, len(levels)) / half).astype(np.float32)
+            tensors[f"{name}.zero"] = (half * rng.uniform(0.85, 1.1, len(levels))).astype(np.int16)
+            widths = (2 * len(levels), *hidden, outputs[network])
+            for n, (a, b) in enumerate(zip(widths[:-1], widths[1:], strict=True)):
+                tensors[f"{name}.weight{n}"] = (rng.normal(size=(b, a)) * np.sqrt(1.4 / a)).astype(np.float16)
+                tensors[f"{name}.bias{n}"] = (0.2 * rng.normal(size=b)).astype(np.float16)
+        models.append(model)
+    config = {
+        "width": width, "height": height, "wrap": wrap, "mode": mode, "variant": variant, "endpoints": endpoints,
+        "metric": metric, "channels": copy.deepcopy(CHANNELS[:7]), "constants": {"specular": [0.5]}, "textures": listed,
+        "models": models, "hidden": list(hidden),
+    }  # fmt: skip
+    return tensors, {"kind": "ntbc", "version": 1, "config": config}
+
+
+def fake_ntbc(path, *, seed=0, **shape) -> dict:
+    """Write a :func:`random_ntbc` to ``path`` and return its header."""
+    tensors, header = random_ntbc(np.random.default_rng(seed), **shape)
+    write_asset(path, tensors, header)
+    return header

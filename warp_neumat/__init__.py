@@ -25,6 +25,7 @@ _HOMES = {
     "bc7_decode": "kernels.bc7",
     "corners": "kernels.healpix",
     "export_bcf": "export.bcf",
+    "export_ntbc": "export.ntbc",
     "fit": "training.fit",
     "fit_shared": "training.sharing",
     "half_vectors": "kernels.frame",

@@ -224,7 +224,7 @@ def test_a_broken_picture_is_one_line(run, maps, tmp_path, keep):
     ("arguments", "code", "message"),
     [
         (("--preset", "3k"), 2, "--preset must be one of 0.5k, 1k, 2k, 2k++, quick, standard, fine, got '3k'"),
-        (("--model", "nbrdf"), 2, "--model must be one of neubrdf, bcf, btf, got 'nbrdf'; nearest: neubrdf"),
+        (("--model", "nbrdf"), 2, "--model must be one of neubrdf, bcf, btf, ntbc, got 'nbrdf'; nearest: neubrdf"),
         (("--features", "16,x"), 2, "--features must be whole numbers"),
         (("--features", "16,8", "--preset", "1k"), 1, "give a preset, features or bytes, not two of them"),
         (("--size", "0x4"), 2, "--size must be WxH or the longer side"),
@@ -246,7 +246,7 @@ def test_a_broken_picture_is_one_line(run, maps, tmp_path, keep):
         (("--steps", "0"), 1, "steps must be a whole number of at least 1"),
         (("--steps", "many"), 2, "valid integer"),
         (("--model", "neubrdf"), 1, "maps"),
-        (("--model", "neubrdf", "--size", "8"), 2, "--size is for model bcf, not neubrdf"),
+        (("--model", "neubrdf", "--size", "8"), 2, "--size is for model bcf or ntbc, not neubrdf"),
         (("--device", "abacus"), 1, "abacus"),
         (("-o", "a.png"), 2, "-o must end in .neumat, got 'a.png'"),
     ],

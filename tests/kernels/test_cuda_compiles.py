@@ -21,6 +21,7 @@ from warp_neumat.kernels import (
     lod,
     mlp,
     neubrdf,
+    ntbc,
     proxy,
     schedule,
     shade,
@@ -72,6 +73,16 @@ def _shade_btf():
     return shade.make_shade_kernel(btf.functions, btf.Layout(), 1, textured=True).module
 
 
+def _ntbc():
+    shape = ntbc.NetworkShape(((16, 16), (32, 32)), 16), ntbc.NetworkShape(((16, 16),), 8)
+    return ntbc.make_blocks_kernel(ntbc.ModelShape(*shape, (("bc1", 3), ("bc4", 1), ("bc7", 4))), False).module
+
+
+def _ntbc_naive():
+    shape = ntbc.NetworkShape(((16, 16),), 8), ntbc.NetworkShape(((16, 16), (32, 32)), 2)
+    return ntbc.make_blocks_kernel(ntbc.ModelShape(*shape, (("bc1", 3), ("bc4", 1)), naive=True), False).module
+
+
 def _bcf_step():
     return bcf_train.step_kernel(bcf_train.StepShape(textures=4, hidden=16, channels=9), 1).module
 
@@ -96,6 +107,8 @@ MODULES = {
     "height_field_pack": lambda: height_field_light._make_light(1)[2].module,
     "height_field_slices": lambda: height_field_light._make_slice(1, 2).module,
     "bcf_step": _bcf_step,
+    "ntbc": _ntbc,
+    "ntbc_naive": _ntbc_naive,
     "block_decode": lambda: block_texture.make_block_kernels()[0].module,
     "block_adjoint": lambda: block_texture.make_block_kernels()[1].module,
     "bc6h_pack": lambda: bc6h_encode_pack.bc6h_pack_kernel.module,

@@ -22,7 +22,23 @@ from warp_neumat.cli.values import (
 
 Asset = Annotated[Path, typer.Argument(help="A .neumat file.")]
 
-_OWN = ("model", "preset", "features", "bytes", "steps", "seed", "resume", "size", "crop", "overrides", "device")
+_OWN = (
+    "model",
+    "mode",
+    "preset",
+    "features",
+    "bytes",
+    "steps",
+    "seed",
+    "resume",
+    "size",
+    "crop",
+    "overrides",
+    "device",
+)
+
+_MAPS = ("bcf", "ntbc")
+"""Kinds that are sets of maps."""
 
 
 @app.command()
@@ -30,8 +46,8 @@ def fit(
     source: Annotated[
         str,
         typer.Argument(
-            help="A folder of PBR maps or its .json manifest (model bcf); a MERL .binary, an RGL .bsdf, a .csv of "
-            "samples, FILE.npz:NAME, analytic:ggx?roughness=0.2&f0=0.9,0.6,0.3, analytic:layered?… or "
+            help="A folder of PBR maps or its .json manifest (models bcf, ntbc); a MERL .binary, an RGL .bsdf, a .csv "
+            "of samples, FILE.npz:NAME, analytic:ggx?roughness=0.2&f0=0.9,0.6,0.3, analytic:layered?… or "
             "svbrdf:FOLDER, PBR maps as a reflectance (model neubrdf); a UBO2014 .btf, a UBO2003 .zip or its folder, "
             "or simulated microgeometry:PATTERN?size=128&seed=0 with pattern weave, leather, carpet, wood or stone "
             "(model btf). "
@@ -40,7 +56,16 @@ def fit(
     ],
     out: Annotated[Path | None, typer.Option("-o", "--out", help="Asset to write, ending in .neumat.")] = None,
     model: Annotated[
-        str | None, typer.Option(help="Kind of material: bcf, neubrdf or btf; default: the one that SOURCE is for.")
+        str | None,
+        typer.Option(
+            help="Kind of material: bcf, ntbc, neubrdf or btf; default: the one that SOURCE is for, bcf for maps."
+        ),
+    ] = None,
+    mode: Annotated[
+        str | None,
+        typer.Option(
+            help="ntbc: conservative, a model for colours and one for single channels, or aggressive, one for all."
+        ),
     ] = None,
     preset: Annotated[
         str | None,
@@ -57,7 +82,8 @@ def fit(
         ),
     ] = None,
     budget: Annotated[
-        int | None, typer.Option("--bytes", min=1, help="Sizes of the feature textures by what they may take [byte].")
+        int | None,
+        typer.Option("--bytes", min=1, help="Sizes of the feature textures, or of an ntbc's grids, by bytes to spend."),
     ] = None,
     steps: Annotated[int | None, typer.Option(help="Training steps; default: the model's and the preset's.")] = None,
     seed: Annotated[int, typer.Option(help="Same seed, same file.")] = 0,
@@ -91,7 +117,8 @@ def fit(
         typer.Option(
             help="Any other setting of the model or of its training, repeatable: wrap=clamp, modes=single, "
             "batch=65536, nside=64, bits=9, hidden=64,64, frame=absolute, interpolation=uniform; btf: variant=neumip, "
-            "teacher=none, teacher=FILE.neumat, mips=1, schedule=plateau."
+            "teacher=none, teacher=FILE.neumat, mips=1, schedule=plateau; ntbc: rate=0.45, variant=naive, normals=bc1, "
+            "colours=bc7, metric=luma, endpoints=fitted."
         ),
     ] = None,
     device: Device = "cpu",
@@ -101,6 +128,7 @@ def fit(
     \b
     neumat fit bricks/ -o bricks.neumat --preset 1k
     neumat fit bricks/ -o bricks.neumat --crop 0,0,512,512 --override normal.orientation=dx
+    neumat fit bricks/ -o bricks.neumat --model ntbc --mode aggressive
     neumat fit FILE.npz:alum-bronze -o bronze.neumat
     neumat fit FILE.npz --shared metals/
     neumat fit 'microgeometry:weave?size=128' -o weave.neumat
@@ -136,6 +164,10 @@ def fit(
     model = training.default_model(source) if model is None else one_of("--model", model, REGISTRY)
     if reciprocal and model != "neubrdf":
         raise Usage(f"--reciprocal is for model neubrdf, not {model}")
+    if mode is not None:
+        if model != "ntbc":
+            raise Usage(f"--mode is for model ntbc, not {model}")
+        config["mode"] = one_of("--mode", mode, ("conservative", "aggressive"))
     if preset is not None:
         one_of("--preset", preset, training.presets(model))
     if is_btf_spec(source) and model != "btf":
@@ -145,11 +177,12 @@ def fit(
     if model == "btf" and (named := {"width", "height"} & set(config)):
         raise Usage(f"--option {min(named)}: a btf has the size of its source, as microgeometry:weave?size=64")
     textured = model == "neubrdf" and source.startswith("svbrdf:")
-    for name in opening if model != "bcf" else ():
+    for name in opening if model not in _MAPS else ():
         if textured and name in ("size", "crop", "overrides"):
             continue
         if opening[name] is not None:
-            raise Usage(f"--{name.removesuffix('s') if name == 'overrides' else name} is for model bcf, not {model}")
+            written = name.removesuffix("s") if name == "overrides" else name
+            raise Usage(f"--{written} is for model {' or '.join(_MAPS)}, not {model}")
 
     start = time.perf_counter()
     if shared is not None:
@@ -175,6 +208,8 @@ def fit(
 
 def _features(text: str, model: str):
     """Return what ``--features`` stands for: sides, the width of a primitive, or a way to store them."""
+    if model == "ntbc":
+        raise Usage("--features is for models bcf, neubrdf and btf; sizes of an ntbc follow from --bytes")
     if model == "btf":
         return one_of("--features", text, ("half", "bc6h"))
     numbers = parse_features(text)
@@ -209,12 +244,12 @@ def _fit_shared(source, folder: Path, groups, preset, steps, seed, resume, devic
 @app.command("eval")
 def evaluate(
     asset: Asset,
-    against: Annotated[str, typer.Option(help="The source, as for fit; a bcf remembers its size, crop and overrides.")],
+    against: Annotated[str, typer.Option(help="The source, as for fit; maps remember their size, crop and overrides.")],
     json_file: Annotated[str | None, typer.Option("--json", help="JSON to this file; - for standard output.")] = None,
     picture: Annotated[
         Path | None,
         typer.Option(
-            help="Write source, asset and ten times their difference side by side to this PNG, then for a bcf with "
+            help="Write source, asset and ten times their difference side by side to this PNG, then for maps with "
             "baselines BC at half resolution and its difference, a row a map; of a btf, a column for each of six "
             "slices, and below them the apparent BRDF of the central texel."
         ),
@@ -222,11 +257,13 @@ def evaluate(
     baselines: Annotated[
         str | None,
         typer.Option(
-            help="bcf: what to compare with, of bc_full, bc_half, bc7_full, bc7_half, astc12, astc12_half, with commas "
-            "between them; default: all but the last."
+            help="bcf, ntbc: what to compare with, of bc_full, bc_half, bc7_full, bc7_half, astc12, astc12_half, with "
+            "commas between them; default: all but the last."
         ),
     ] = None,
-    no_baselines: Annotated[bool, typer.Option("--no-baselines", help="bcf: this file alone, which is quick.")] = False,
+    no_baselines: Annotated[
+        bool, typer.Option("--no-baselines", help="bcf, ntbc: this file alone, which is quick.")
+    ] = False,
     device: Device = "cpu",
 ):
     """Measure an asset against its source.
@@ -248,11 +285,11 @@ def evaluate(
     material = load(asset, device=device)
     if is_btf_spec(against) and material.kind != "btf":
         raise Usage(f"{against} is a bidirectional texture function, and {asset} is of kind {material.kind}")
-    if material.kind == "bcf":
+    if material.kind in _MAPS:
         names = False if no_baselines else True if baselines is None else [b.strip() for b in baselines.split(",")]
         record, text = measure_maps(material, against, names, picture)
     elif baselines or no_baselines:
-        raise Usage(f"--baselines are for a bcf; {asset} is of kind {material.kind}")
+        raise Usage(f"--baselines are for a bcf or ntbc; {asset} is of kind {material.kind}")
     else:
         measure = measure_btf if material.kind == "btf" else measure_brdf
         record, text = measure(material, against, picture)
@@ -296,7 +333,7 @@ def decode(
     bits: Annotated[int, typer.Option(help="Bits of a channel in PNG: 8 or 16.")] = 8,
     device: Device = "cpu",
 ):
-    """Turn a bcf back into PNG and EXR maps.
+    """Turn a bcf or ntbc back into PNG and EXR maps.
 
     \b
     neumat decode bricks.neumat -o maps/ --size 1024x1024
@@ -320,24 +357,35 @@ def export(
     shader: Annotated[
         list[str] | None,
         typer.Option(
-            help="Language of the decoder source: glsl, hlsl or wgsl, repeatable; none: no source. Default: all."
+            help="bcf: language of the decoder source, glsl, hlsl or wgsl, repeatable; none: no source. Default: all."
         ),
     ] = None,
 ):
-    """Write a bcf as an engine reads it.
+    """Write a bcf or ntbc as an engine reads it.
 
-    BC6H textures with mips, the network in float16, a manifest with a golden vector, and decoder source.
+    Of a bcf: BC6H textures with mips, the network in float16, a manifest with a golden vector, and decoder source. Of
+    an ntbc: the BC1 to BC7 textures with mips that it stands for, which need no decoder, and a manifest.
 
     \b
     neumat export bricks.neumat -o engine/ --format ktx2 --shader wgsl
     """
     start_warp()
-    from warp_neumat.export.bcf import CONTAINERS, export_bcf
+    from warp_neumat.export.bcf import export_bcf
+    from warp_neumat.export.files import CONTAINERS
     from warp_neumat.export.languages import LANGUAGES
+    from warp_neumat.io.asset import read_asset
 
     one_of("--format", format, CONTAINERS)
     wanted = list(LANGUAGES) if not shader else [one_of("--shader", s, [*LANGUAGES, "none"]) for s in shader]
     if "none" in wanted and len(wanted) > 1:
         raise Usage("--shader none stands alone")
-    for path in export_bcf(asset, out, format=format, shaders=[s for s in wanted if s != "none"]):
+    if read_asset(asset)[1]["kind"] == "ntbc":
+        if shader and wanted != ["none"]:
+            raise Usage(f"--shader is for a bcf; {asset} is an ntbc, whose textures need no decoder")
+        from warp_neumat.export.ntbc import export_ntbc
+
+        paths = export_ntbc(asset, out, format=format)
+    else:
+        paths = export_bcf(asset, out, format=format, shaders=[s for s in wanted if s != "none"])
+    for path in paths:
         print(path)

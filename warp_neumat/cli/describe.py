@@ -2,18 +2,25 @@
 
 import math
 
+from warp_neumat.io.block_formats import mip_bytes, mip_limit
+
 
 def describe(header: dict, tensors: dict) -> list[str]:
     """Return the lines of an asset's header and tensors (name → dtype, shape, bytes), by kind."""
     if header["kind"] == "btf":
         return _btf(header, tensors)
-    lines = _maps(header.get("config", {}), tensors) if header["kind"] == "bcf" else _fields(header, "config")
+    makers = {"bcf": _features, "ntbc": _blocks}
+    config = header.get("config", {})
+    if header["kind"] in makers:
+        lines = [_material(config, tensors), *makers[header["kind"]](config, tensors), *_channels(config)]
+    else:
+        lines = _fields(header, "config")
     for part in ("group", "source", "training", "metrics"):
         lines += _fields(header, part)
     for name, file in header.get("maps", {}).get("files", {}).items():
         lines.append(f"  maps.{name}: {file}")
     lines += [f"  note: {note}" for note in header.get("maps", {}).get("notes", [])]
-    if header["kind"] != "bcf":
+    if header["kind"] not in makers:
         lines += [f"  {name}: {t['dtype']} {t['shape']}, {t['bytes']} bytes" for name, t in tensors.items()]
     return lines
 
@@ -70,26 +77,68 @@ def _short(value) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
-def _maps(config: dict, tensors: dict) -> list[str]:
-    """Return what a bcf is made of: size, textures with their mips, network, channels, constants."""
+def _material(config: dict, tensors: dict) -> str:
+    """Return the size of a set of maps, and what a texel of a channel takes."""
     width, height, channels = config["width"], config["height"], config["channels"]
-    total = sum(t["bytes"] for t in tensors.values())
-    bits = 8 * total / (width * height * len(channels))
-    lines = [
-        f"  material: {width}×{height}, {len(channels)} channels, wrap {config['wrap']}, {bits:.3g} bit/texel/channel"
-    ]
+    bits = 8 * sum(t["bytes"] for t in tensors.values()) / (width * height * len(channels))
+    size = f"{width}×{height}, {len(channels)} channels, wrap {config['wrap']}"
+    return f"  material: {size}, {bits:.3g} bit/texel/channel"
+
+
+def _features(config: dict, tensors: dict) -> list[str]:
+    """Return what a bcf is made of: textures with their mips, and the network."""
+    lines = []
     for number, texture in enumerate(config["textures"]):
         size = sum(t["bytes"] for name, t in tensors.items() if name.startswith(f"texture{number}.mip"))
-        level = max(0.0, math.log2(max(width / texture["width"], height / texture["height"])))
+        level = max(0.0, math.log2(max(config["width"] / texture["width"], config["height"] / texture["height"])))
         kind = "bc6h_sf16" if config["signed"] else "bc6h_uf16"
         lines.append(
             f"  texture{number}: {kind} {texture['width']}×{texture['height']}, {texture['mips']} mips, {size} bytes, "
             f"sharp from mip {level:.3g} of the material on"
         )
     hidden, size = config["hidden"], sum(t["bytes"] for name, t in tensors.items() if not name.startswith("texture"))
-    lines.append(f"  network: {3 * len(config['textures'])}→{hidden}→{len(channels)}, float16, {size} bytes")
-    maps: dict[str, list[dict]] = {}
-    for channel in channels:
+    widths = f"{3 * len(config['textures'])}→{hidden}→{len(config['channels'])}"
+    return [*lines, f"  network: {widths}, float16, {size} bytes"]
+
+
+def _blocks(config: dict, tensors: dict) -> list[str]:
+    """Return what an ntbc is made of: the textures that it writes, and the networks of each model."""
+    names = [f"{channel['map']}.{channel['component']}" for channel in config["channels"]]
+    width, height = config["width"], config["height"]
+    fields = ("mode", "variant", "endpoints", "metric")
+    lines = ["  " + ", ".join(f"{name} {config[name]}" for name in fields)]
+    total = 0
+    for texture in config["textures"]:
+        held = ", ".join(names[k] for plane in texture["planes"] for k in plane["channels"])
+        mips = mip_limit(width, height)
+        size = sum(mip_bytes(texture["format"], width, height, mip) for mip in range(mips))
+        total += size
+        lines.append(f"  texture {texture['name']}: {texture['format']}, {mips} mips, {size} bytes ({held})")
+    stored = sum(t["bytes"] for t in tensors.values())
+    lines.append(f"  textures: {total} bytes at load, {stored} here: {stored / total:.1%}")
+    for i, model in enumerate(config["models"]):
+        planes = [config["textures"][t]["planes"][p]["format"] for t, p in model["planes"]]
+        lines.append(f"  model{i}: {len(planes)} planes ({', '.join(planes)})")
+        for network in ("endpoint", "texel"):
+            if model[network] is None:
+                continue
+            parts = {n: t for n, t in tensors.items() if n.startswith(f"model{i}.{network}.")}
+            grids = sum(t["bytes"] for n, t in parts.items() if ".grid" in n)
+            rest = sum(t["bytes"] for t in parts.values()) - grids
+            levels = model[network]["levels"]
+            sizes = " … ".join("×".join(map(str, levels[k])) for k in sorted({0, len(levels) - 1}))
+            outputs = parts[f"model{i}.{network}.bias{len(config['hidden'])}"]["shape"][0]
+            features, bits = model[network].get("features", 2), model[network].get("bits", 8)
+            widths = "→".join(map(str, [features * len(levels), *config["hidden"], outputs]))
+            kept = f"{len(levels)} grids {sizes} of {features} features in {bits} bits, {grids} bytes"
+            lines.append(f"    {network}: {kept}; {widths}, {rest} bytes")
+    return lines
+
+
+def _channels(config: dict) -> list[str]:
+    """Return the maps of a set and their constants."""
+    lines, maps = [], {}
+    for channel in config["channels"]:
         maps.setdefault(channel["map"], []).append(channel)
     for name, own in maps.items():
         parts = " ".join(channel["component"] for channel in own)

@@ -17,7 +17,7 @@ from safetensors.numpy import save
 
 from warp_neumat.io.atomic import replacing
 
-KINDS = {"bcf": 1, "btf": 1, "neubrdf": 2, "neubrdf-group": 1}
+KINDS = {"bcf": 1, "btf": 1, "neubrdf": 2, "neubrdf-group": 1, "ntbc": 1}
 """Known kinds and the newest version of each that this release reads."""
 
 _KEY = "neumat"
@@ -140,8 +140,18 @@ def pack_bits(values: np.ndarray, bits: int) -> np.ndarray:
         raise ValueError(
             f"values must lie in [0, {(1 << bits) - 1}] for {bits} bits, got {values.min()} … {values.max()}"
         )
-    planes = (values.astype(np.uint16)[:, None] >> np.arange(bits, dtype=np.uint16)) & np.uint16(1)
-    return np.packbits(planes.astype(np.uint8).ravel(), bitorder="little")
+    if bits == 8:
+        return values.astype(np.uint8)
+    if bits < 8:
+        planes = np.unpackbits(values.astype(np.uint8)[:, None], axis=1, count=bits, bitorder="little")
+    else:
+        planes = (values.astype(np.uint16)[:, None] >> np.arange(bits, dtype=np.uint16)) & np.uint16(1)
+    return np.packbits(planes.astype(np.uint8, copy=False).ravel(), bitorder="little")
+
+
+def packed_bytes(count: int, bits: int) -> int:
+    """Return the bytes that ``count`` values of ``bits`` bits take."""
+    return -(-count * bits // 8)
 
 
 def unpack_bits(data: np.ndarray, bits: int, count: int) -> np.ndarray:
@@ -153,8 +163,12 @@ def unpack_bits(data: np.ndarray, bits: int, count: int) -> np.ndarray:
     data = np.asarray(data, np.uint8).ravel()
     if not 1 <= bits <= 16:
         raise ValueError(f"bits must be in [1, 16], got {bits}")
-    needed = -(-count * bits // 8)
+    needed = packed_bytes(count, bits)
     if data.size != needed:
         raise ValueError(f"{count} values of {bits} bits need {needed} bytes, got {data.size}")
+    if bits == 8:
+        return data.astype(np.int32)
     planes = np.unpackbits(data, bitorder="little", count=count * bits).reshape(count, bits)
+    if bits < 8:
+        return np.packbits(planes, axis=1, bitorder="little")[:, 0].astype(np.int32)
     return planes.astype(np.int32) @ (np.int32(1) << np.arange(bits, dtype=np.int32))

@@ -39,11 +39,14 @@ class Layout:
 
     Attributes:
         textures: Number of feature textures T.
-        hidden: Width of the hidden layer.
-        channels: Outputs of the network.
+        hidden: Width of the hidden layer; 0 = there is no network, and the features are the outputs.
+        channels: Outputs of the network; without one, 3T.
         wrap: One of ``filter.WRAPS``.
         signed: Whether blocks are BC6H_SF16.
-        storage: One of :data:`STORAGES`.
+        storage: One of :data:`STORAGES`, or ``"rgba8"`` for textures of plain 8-bit values, v/255.
+
+    Raises:
+        ValueError: If there is no network, and not as many channels as features.
     """
 
     textures: int = 4
@@ -53,6 +56,10 @@ class Layout:
     signed: bool = False
     storage: str = "unquantised"
 
+    def __post_init__(self):
+        if not self.hidden and self.channels != 3 * self.textures:
+            raise ValueError(f"{self.textures} textures without a network have 3 channels each, got {self.channels}")
+
     @property
     def shape(self) -> MLPShape:
         """Sizes of the network."""
@@ -60,7 +67,7 @@ class Layout:
 
     def scratch(self, lanes: int) -> int:
         """Return the float32 words of scratch for one block of ``lanes`` lanes."""
-        return 3 * self.textures * lanes
+        return 3 * self.textures * lanes if self.hidden else 0
 
 
 @wp.struct
@@ -131,6 +138,8 @@ def make_maps(layout: Layout, lanes: int):
     test_encoded_matches_float64.
     """
     sample = make_sampler(layout.textures, layout.wrap, layout.signed, layout.storage, lanes)
+    if not layout.hidden:
+        return _features_alone(sample, layout.channels * lanes)
     shape = layout.shape
     mlp = make_mlp(shape, lanes)
     FEATURES, OUTPUTS, PARAMETERS = shape.inputs * lanes, shape.outputs * lanes, shape.parameters
@@ -156,6 +165,28 @@ def make_maps(layout: Layout, lanes: int):
         mlp(X, W, y)
         Y = wp.array(ptr=y.ptr, shape=(OUTPUTS,), dtype=wp.float32)
         for i in range(OUTPUTS):
+            Y[i] = wp.clamp(Y[i], 0.0, 1.0)
+
+    return maps
+
+
+def _features_alone(sample, size: int):
+    """Return the Warp function ``maps`` of a material without a network; ``size`` is channels × lanes."""
+    SIZE = size
+
+    @wp.func
+    def maps(
+        arguments: Arguments,
+        u: wp.array(dtype=wp.float32),
+        v: wp.array(dtype=wp.float32),
+        lod: wp.array(dtype=wp.float32),
+        count: int,
+        scratch: wp.uint64,
+        y: wp.array(dtype=wp.float32),
+    ):
+        sample(arguments.texels, arguments.tables, arguments.levels, arguments.level_at, u, v, lod, count, y)
+        Y = wp.array(ptr=y.ptr, shape=(SIZE,), dtype=wp.float32)
+        for i in range(SIZE):
             Y[i] = wp.clamp(Y[i], 0.0, 1.0)
 
     return maps
@@ -234,7 +265,7 @@ def _make_moves(lanes: int):
 
 @functools.cache
 def make_eval_kernel(layout: Layout, lanes: int):
-    """Return the kernel behind ``BCf.encoded`` and ``BCf.maps``.
+    """Return the kernel behind ``MapMaterial.encoded`` and ``MapMaterial.maps``.
 
     ``columns`` rows of :data:`PROGRAM` words say what is written for each sample: encoding (:data:`LINEAR` …
     NORMAL_Z); the channel, and for normals the other component's channel; first column of the map among all columns,

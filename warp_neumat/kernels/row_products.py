@@ -15,6 +15,23 @@ auto select = [](I8 m, V a, V b) { return (V)(((I8)a & m) | ((I8)b & ~m)); };
 """
 """Types V and I8 of 8 lanes, zero Z, sum8(v), clamped(v) to [0, 1], and select(mask, a, b)."""
 
+EXPONENTIAL = """
+auto larger = [](V a, V b) { return a > b ? a : b; };
+auto smaller = [](V a, V b) { return a < b ? a : b; };
+auto scaled_exponential = [=](V x, const float s) {
+    x = larger(V{} - 69.0f, x);
+    const V whole = x * 1.4426950408889634f + 12582912.0f;  // 1.5 * 2^23: what is left of the mantissa is an integer
+    const V f = x * 1.4426950408889634f - (whole - 12582912.0f);
+    V p = f * (s * 1.326470879e-3f) + s * 9.671511471e-3f; p = p * f + s * 5.550733776e-2f;
+    p = p * f + s * 2.402224210e-1f; p = p * f + s * 6.931469776e-1f; p = p * f + s;
+    return (V)((I8)p + ((I8)whole << 23));
+};
+auto exponential = [=](V x) { return scaled_exponential(x, 1.0f); };
+"""
+"""larger(a, b) and smaller(a, b), one instruction each, which give b where either is NaN; and exponential(v), e^x for x
+up to 87 and e^-69 below -69: 2^n times a polynomial for 2^f on [-1/2, 1/2] (degree 5, by Lawson's iteration, 9.2e-8),
+3e-7 relative with rounding. scaled_exponential(v, s) has a constant s > 0 times that at no cost."""
+
 
 def padded(width: int) -> int:
     """Return ``width`` rounded up to whole registers of 8 float32."""
@@ -39,12 +56,15 @@ def product(
     add=False,
     hardswish=None,
     slope=None,
+    slope_of=None,
+    apply=None,
 ) -> str:
-    """C++ of out[r][o] = start + Σ_k a[r·row + k·step] · b[k·stride + o], 4 rows by 16 columns or 8 by 8 at a time.
+    """C++ of out[r][o] = start + Σ_k a[r·row + k·step] · b[k·stride + o], 4 rows by 24 or 16 columns at a time.
 
     ``rows`` and ``columns`` are multiples of 8. ``start`` is the name of a row to start from, ``mask`` of a matrix like
     ``out``: 0 is written where it is not above 0. ``hardswish`` is where the slopes of that activation go, a matrix
-    like ``out``; ``slope`` one that the result is multiplied with.
+    like ``out``; ``slope`` one that the result is multiplied with, or with what the function ``slope_of`` makes of it.
+    ``apply`` is a function of registers that the result goes through.
     """
 
     def tile(vectors: int, tall: int, begin: int, end: int) -> str:
@@ -73,17 +93,21 @@ def product(
                 text.append(f"*(V*)({hardswish} + {cell}) = select((t > 0.0f) & (t < 1.0f), 2.0f * t - 0.5f, t);")
                 text.append(f"{value} = s * t; }}")
             if slope:
-                value = f"{value} * *(const V*)({slope} + {cell})"
+                value = f"{value} * {slope_of or ''}(*(const V*)({slope} + {cell}))"
+            if apply:
+                value = f"{apply}({value})"
             if mask:
                 value = f"select(*(const V*)({mask} + (r + {r}) * {width} + o + {8 * u}) > 0.0f, {value}, Z)"
             text.append(f"*(V*){place} {'+=' if add else '='} {value};")
         text.append("}")
         return "\n".join(text)
 
-    # Columns are a multiple of 8: tiles of 4 by 16 leave at most one of 8, which is as tall as keeps 8 sums going.
-    whole = columns // 16 * 16
+    # Tiles of 4 by 24 load least; of 4 by 16 next; one of 8 columns is as tall as keeps 8 sums going.
+    vectors = columns // 8
+    threes = vectors // 3 - (vectors % 3 == 1 and vectors > 1)
+    wide, whole = 24 * threes, columns // 8 * 8 - 8 * ((vectors - 3 * threes) % 2)
     return "\n".join(
         tile(vectors, tall, begin, end)
-        for vectors, tall, begin, end in ((2, 4, 0, whole), (1, 8, whole, columns))
+        for vectors, tall, begin, end in ((3, 4, 0, wide), (2, 4, wide, whole), (1, 8, whole, columns))
         if end > begin
     )

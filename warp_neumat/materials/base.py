@@ -16,6 +16,7 @@ KINDS = {
     "bcf": "warp_neumat.materials.bcf:BCf",
     "btf": "warp_neumat.materials.btf:BTF",
     "neubrdf": "warp_neumat.materials.neubrdf:NeuBRDF",
+    "ntbc": "warp_neumat.materials.ntbc:NTBC",
 }
 """Where the class of each kind lives: a kind that a scene does not use is never imported, so never compiled."""
 

@@ -8,14 +8,20 @@ Models of reflectance (``DATA = "brdf"`` and ``"btf"``) are trained by :mod:`war
 ``from_asset(tensors, config)``, ``prepare(samples) -> batch``, ``predict(batch)``, ``gradients(batch, loss)``,
 ``event_samples()``, ``stages()``, ``trainable(stage)``, ``rates(parameters)``, ``step_threads``, ``begin``, ``enter``,
 ``event``, and those of BRDFs ``evaluate(*inputs)``;
-:class:`warp_neumat.models.neubrdf.NeuBRDF` says what each does. Models of texture sets (``"maps"``) are trained by
-:mod:`warp_neumat.training.block_loop`, which knows the buffers of :class:`warp_neumat.models.bcf.BCf`.
+:class:`warp_neumat.models.neubrdf.NeuBRDF` says what each does. Models of texture sets (``"maps"`` and
+``"block_maps"``) have a trainer each that knows their buffers: :mod:`warp_neumat.training.block_loop` and
+:mod:`warp_neumat.training.ntbc_loop`.
 """
 
 import difflib
 import importlib
 
-REGISTRY = {"neubrdf": "warp_neumat.models.neubrdf", "bcf": "warp_neumat.models.bcf", "btf": "warp_neumat.models.btf"}
+REGISTRY = {
+    "neubrdf": "warp_neumat.models.neubrdf",
+    "bcf": "warp_neumat.models.bcf",
+    "btf": "warp_neumat.models.btf",
+    "ntbc": "warp_neumat.models.ntbc",
+}
 """Module of every model, by the name that ``neumat fit --model`` takes and assets carry as ``kind``."""
 
 

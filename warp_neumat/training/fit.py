@@ -7,12 +7,9 @@ leave a checkpoint beside the output and go on from there with ``resume=True``.
 from __future__ import annotations
 
 import dataclasses
-import json
-import math
 import os
 from pathlib import Path
 
-import numpy as np
 import torch
 
 from warp_neumat import models
@@ -20,15 +17,13 @@ from warp_neumat.io import svbrdf
 from warp_neumat.io.asset import write_asset
 from warp_neumat.io.atomic import check_writable
 from warp_neumat.io.brdf import open_brdf
-from warp_neumat.io.texture_set import open_texture_set
-from warp_neumat.materials.bcf import BCf as BCfMaterial
 from warp_neumat.simulation.open_btf import is_btf_spec
 from warp_neumat.training import losses, samplers, spatial
-from warp_neumat.training.block_loop import BlockTrainer
+from warp_neumat.training.block_maps import BlockMapData
 from warp_neumat.training.btf import BTFData
 from warp_neumat.training.evaluate import brdf_metrics
-from warp_neumat.training.evaluate_maps import sample_grid
 from warp_neumat.training.loop import Plan, Trainer
+from warp_neumat.training.maps import MapData
 from warp_neumat.training.presets import PRESETS, length_of
 from warp_neumat.training.threads import all_threads
 
@@ -132,68 +127,7 @@ class BRDFData:
         return tensors, header, {**brdf_metrics(source, evaluate), **rate}
 
 
-class MapData:
-    """What a fit does with sources of kind ``maps``: folders of PBR textures."""
-
-    OPTIONS = ("size", "crop", "overrides")
-    BATCH = 16384
-    open = staticmethod(open_texture_set)
-
-    @staticmethod
-    def configured(module, source, preset, options):
-        """Return (length factor, batch, config); a preset names the sizes of the features, or the length."""
-        length = preset if preset in PRESETS else None
-        batch = options.pop("batch", None)
-        if batch is not None and (isinstance(batch, bool) or not isinstance(batch, int) or batch < 256 or batch % 256):
-            raise ValueError(f"batch must be a multiple of 256, got {batch!r}")
-        if preset is not None and length is None:
-            length_of(preset, {**PRESETS, **module.PRESETS})
-        try:
-            shape = module.configure(source, options, None if length else preset)
-        except TypeError as error:
-            given = ", ".join(f"{name}={value!r}" for name, value in options.items())
-            raise ValueError(f"an option is of the wrong type: {given} ({error})") from None
-        return length_of(length), batch or MapData.batch(shape), shape
-
-    @staticmethod
-    def batch(shape) -> int:
-        """Return the samples a step takes: 2¹⁴, and in proportion to the features beyond 2¹⁷ texels, up to 2¹⁷."""
-        share = shape.pyramids.texel_count / (1 << 17)
-        return 256 * round(min(max(share, 1.0), 8.0) * MapData.BATCH / 256)
-
-    @staticmethod
-    def opening(source, arguments: dict) -> dict:
-        """Return the arguments that open the source equally: size and crop as they were settled, and overrides."""
-        settled = source.manifest()
-        found = {name: settled[name] for name in ("size", "crop") if name in settled}
-        if arguments.get("overrides"):
-            found["overrides"] = json.loads(json.dumps(arguments["overrides"], default=os.fspath))
-        return found
-
-    @staticmethod
-    def described(source, shape) -> str:
-        """Return the table of maps and a line on the feature textures."""
-        sizes = ", ".join(f"{width}×{height}" for width, height in shape.features)
-        return f"{source.table()}\nfeature textures: {sizes}"
-
-    @staticmethod
-    def trainer(module, source, shape, plan, device, *, checkpoint, **more):
-        """Return the trainer of the texture set."""
-        mips = source.mips()
-        mean = mips[0].reshape(-1, mips[0].shape[2]).mean(axis=0)
-        model = module.build(shape, plan.seed, mean).to(device)
-        return BlockTrainer(model, mips, plan, checkpoint_path=checkpoint, **more)
-
-    @staticmethod
-    def stored(module, source, trainer) -> tuple[dict, dict, dict]:
-        """Return (tensors, header, metrics); metrics hold the PSNR averaged over mips, as the paper does."""
-        tensors, header = trainer.model.to_asset(trainer.packed)
-        material = BCfMaterial(tensors, header, path=Path(source.name), device="cpu")
-        header["maps"] = {"files": source.files, "notes": list(source.notes)}
-        return tensors, header, {"psnr": _mean_psnr(trainer.mips, material.encoded)}
-
-
-DATA = {"brdf": BRDFData, "maps": MapData, "btf": BTFData}
+DATA = {"brdf": BRDFData, "maps": MapData, "block_maps": BlockMapData, "btf": BTFData}
 
 
 def default_model(source) -> str:
@@ -311,16 +245,6 @@ def _whole(name: str, value, least: int) -> int:
     if isinstance(value, bool) or not isinstance(value, int) or value < least:
         raise ValueError(f"{name} must be a whole number of at least {least}, got {value!r}")
     return value
-
-
-def _mean_psnr(mips, encoded) -> float:
-    """Return the PSNR [dB] of the squared error averaged over channels and mips, each mip counting the same."""
-    errors = []
-    for level, picture in enumerate(mips):
-        height, width, channels = picture.shape
-        decoded = sample_grid(encoded, height, width, channels, float(level))
-        errors.append(float(np.square(decoded - picture).mean(dtype=np.float64)))
-    return round(-10.0 * math.log10(max(np.mean(errors), 1e-12)), 4)
 
 
 def _named(source) -> str:
