@@ -50,8 +50,8 @@ class Choice:
     """What to measure.
 
     ``crop`` is the side of the square taken from each set, None for all of it; ``steps`` those of each fit, None for
-    the fit's own; ``lengths`` the steps of Figure 6; ``options`` go to every fit beside the method's; ``out`` keeps
-    fitted files and plots.
+    the fit's own; ``lengths`` the steps of Figure 6; ``rounds`` those of timings and ``workers`` the threads of a
+    training step; ``options`` go to every fit beside the method's; ``out`` keeps fitted files and plots.
     """
 
     only: tuple[str, ...] = TABLES[:-1]
@@ -63,6 +63,7 @@ class Choice:
     steps: int | None = None
     seed: int = 0
     rounds: int = 9
+    workers: tuple[int, ...] = (1, 2)
     options: dict = dataclasses.field(default_factory=dict)
     out: Path = Path("out/bench_ntbc")
 
@@ -96,20 +97,18 @@ def most_detailed(pixels: np.ndarray, side: int) -> tuple[int, int]:
     height, width, channels = pixels.shape
     if side > min(height, width):
         raise ValueError(f"crop must be at most {min(height, width)} for a set of {width}x{height}, got {side}")
-    rows, columns, need = height // 4, width // 4, -(-side // 4)
+    rows, columns, inner = height // 4, width // 4, side // 4
     blocks = pixels[: 4 * rows, : 4 * columns].reshape(rows, 4, columns, 4, channels)
     detail = np.concatenate([row.std(axis=(0, 2), dtype=np.float64).mean(-1)[None] for row in blocks])
     sums = np.zeros((rows + 1, columns + 1))
     sums[1:, 1:] = detail.cumsum(0).cumsum(1)
     step = max(1, side // 16)
     best, found = -1.0, (0, 0)
-    inner = side // 4
     for y in _starts((height - side) // 4, step):
         for x in _starts((width - side) // 4, step):
             value = sums[y + inner, x + inner] - sums[y, x + inner] - sums[y + inner, x] + sums[y, x]
             if value > best * (1 + 1e-9):  # sums of the same numbers differ in their last digits
                 best, found = value, (4 * x, 4 * y)
-    assert need >= inner
     return found
 
 
@@ -262,16 +261,20 @@ class Lab:
         crop = self.source(name)[0]
         steps = steps or self.choice.steps or DEFAULT_STEPS
         request = {"steps": steps, "seed": self.choice.seed, **self.choice.options, **options}
-        text = json.dumps([str(self.folder(name).resolve().name), crop, request], sort_keys=True)
-        path = self.out / f"{self.folder(name).name}-{hashlib.sha256(text.encode()).hexdigest()[:12]}.neumat"
+        path = self._kept(name, "fit", [crop, request], "neumat")
         facts = path.with_suffix(".json")
         if not path.exists() or not facts.exists():
             more = {} if crop is None else {"crop": crop}
             header = fit(self.folder(name), path, model="ntbc", device=self.device, resume=True, **more, **request)
-            told = {"request": json.loads(text), "seconds": header["training"]["seconds"]}
+            told = {"request": request, "crop": crop, "seconds": header["training"]["seconds"]}
             facts.write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
         seconds = json.loads(facts.read_text(encoding="utf-8"))["seconds"]
         return load(path, device=self.device), seconds, path.stat().st_size
+
+    def _kept(self, name: str, what: str, facts: list, suffix: str) -> Path:
+        """Return the path that what was made of a set with such facts is kept at."""
+        text = json.dumps([what, *facts], sort_keys=True)
+        return self.out / f"{self.folder(name).name}-{hashlib.sha256(text.encode()).hexdigest()[:12]}.{suffix}"
 
     def measure(self, name: str, options: dict, steps: int | None = None, colour: bool = False) -> dict:
         """Return a row's figures of a fit with ``options`` of a set, with those of colours if asked for."""
@@ -291,29 +294,33 @@ class Lab:
 
     def reference(self, name: str, kind: str, options: dict | None = None, colour: bool = False) -> dict:
         """Return a row's figures of block compression, in the formats that a fit with ``options`` writes."""
+        from warp_neumat.io.atomic import replacing
         from warp_neumat.io.block_formats import mip_bytes
         from warp_neumat.models.ntbc import configure
 
         formats = {key: value for key, value in (options or {}).items() if key in ("normals", "colours")}
         key = name, kind, json.dumps(formats, sort_keys=True), colour
         if key not in self._records:
-            _, opened, mips = self.source(name)
+            crop, opened, mips = self.source(name)
             # The rate says nothing of the formats, and the paper's grids always fit.
             config = configure(opened, {**formats, "rate": "paper"})
-            spent = 0.0
-
-            def level(mip):
-                nonlocal spent
-                start = time.perf_counter()
-                result = compressed(config.textures, mip, ROUND_TRIPS[kind])
-                spent += time.perf_counter() - start
-                return result
-
-            found = figures(opened.channels, mips, map(level, mips))
-            seconds = spent
-            if colour:
-                found |= colour_errors(opened.channels, mips[0], level(mips[0]))
             mip0 = sum(mip_bytes(t.format, opened.width, opened.height, 0) for t in config.textures)
+            path = self._kept(name, "reference", [kind, crop, opened.width, opened.height, formats], "npz")
+            if not path.exists():
+                start = time.perf_counter()
+                levels = [compressed(config.textures, mip, ROUND_TRIPS[kind]) for mip in mips]
+                seconds = time.perf_counter() - start
+                levels = {
+                    f"mip{number:02}": np.rint(255 * level).astype(np.uint8) for number, level in enumerate(levels)
+                }
+                with replacing(path) as temporary, open(temporary, "wb") as file:
+                    np.savez_compressed(file, seconds=seconds, **levels)
+            with np.load(path) as kept:
+                levels = [kept[f"mip{number:02}"].astype(np.float32) / np.float32(255) for number in range(len(mips))]
+                seconds = float(kept["seconds"])
+            found = figures(opened.channels, mips, levels)
+            if colour:
+                found |= colour_errors(opened.channels, mips[0], levels[0])
             self._records[key] = {"bytes": config.block_bytes, "bytes_mip0": mip0, **found, "seconds": seconds}
         return dict(self._records[key])
 

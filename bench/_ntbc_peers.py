@@ -150,11 +150,11 @@ def write_blocks(planes, ends: torch.Tensor, texels: torch.Tensor) -> list[torch
 def write_bc1(ends: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
     """Return BC1 blocks of four colours, (N, 8) uint8, for endpoints (N, 6) and colours (N, 16, 3)."""
     most = torch.tensor([31.0, 63.0, 31.0])
-    code = (ends.view(-1, 2, 3) * most + 0.5).int()
+    code = (ends.reshape(-1, 2, 3) * most + 0.5).long()
     word = code[..., 0] << 11 | code[..., 1] << 5 | code[..., 2]
     high, low = word.max(1).values, word.min(1).values
     equal, odd = high == low, (low & 31) > 0
-    high, low = high + (equal & ~odd).int(), low - (equal & odd).int()
+    high, low = high + (equal & ~odd).long(), low - (equal & odd).long()
     first, last = (torch.stack([w >> 11, w >> 5 & 63, w & 31], 1) / most for w in (high, low))
     step = (last - first) / 3
     along = torch.bmm(x - first[:, None], step[:, :, None])[..., 0] / (step * step).sum(1, keepdim=True)
@@ -165,7 +165,7 @@ def write_bc1(ends: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
 
 def write_bc4(ends: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
     """Return BC4 blocks with the closer palette, (N, 8) uint8, for endpoints (N, 2) and values (N, 16, 1)."""
-    x, code = 255 * x[..., 0], (255 * ends + 0.5).int()
+    x, code = 255 * x[..., 0], (255 * ends + 0.5).long()
     high, low = code.max(1, keepdim=True).values, code.min(1, keepdim=True).values
     fifths, sevenths = torch.arange(6), torch.arange(8)
     bounds = torch.tensor([0, 255]).expand(len(x), 2)
@@ -175,7 +175,7 @@ def write_bc4(ends: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
     better = (high[:, 0] > low[:, 0]) & ~(chosen[0][1] < chosen[1][1])
     names = torch.tensor([[6, 0, 2, 3, 4, 5, 1, 7], [1, 7, 6, 5, 4, 3, 2, 0]])
     index = torch.where(better[:, None], names[1][chosen[1][0]], names[0][chosen[0][0]])
-    ordered = torch.where(better[:, None], torch.cat([high, low], 1), torch.cat([low, high], 1)).long()
+    ordered = torch.where(better[:, None], torch.cat([high, low], 1), torch.cat([low, high], 1))
     bits = (index << (3 * torch.arange(16))).sum(1)
     return (ordered[:, 0] | ordered[:, 1] << 8 | bits << 16).view(torch.uint8).view(-1, 8)
 
@@ -290,7 +290,8 @@ class Step:
         self.loss(blocks, self.taps(blocks)).backward()
         found = []
         for network in self.networks:
-            levels = [p.grad if network.spelling == "embedding_bag" else p.grad[0].permute(1, 2, 0) for p in network.levels]
+            bag = network.spelling == "embedding_bag"
+            levels = [p.grad if bag else p.grad[0].permute(1, 2, 0) for p in network.levels]
             found.append(torch.cat([g.reshape(-1) for g in levels]))
             found.append(torch.cat([p.grad.reshape(-1) for p in network.weights]))
         return found

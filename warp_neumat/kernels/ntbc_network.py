@@ -136,8 +136,9 @@ HEAD = (
     + EXPONENTIAL
     + f"""
 auto selu = [&](V x) {{
-    const V e = scaled_exponential(smaller(Z, x), {SELU_SCALE * SELU_ALPHA}f);
-    return larger(Z, x) * {SELU_SCALE}f + (e - {SELU_SCALE * SELU_ALPHA}f);
+    V power;
+    const V p = exponential_parts(x, {SELU_SCALE * SELU_ALPHA}f, power);
+    return (I8)x < 0 ? p * power - {SELU_SCALE * SELU_ALPHA}f : x * {SELU_SCALE}f;
 }};
 auto selu_slope = [&](V y) {{ return select(y > 0.0f, Z + {SELU_SCALE}f, y + {SELU_SCALE * SELU_ALPHA}f); }};
 auto sigmoid = [&](V x) {{ return 1.0f / (1.0f + exponential(smaller(Z + 80.0f, -x))); }};

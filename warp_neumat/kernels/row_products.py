@@ -18,19 +18,22 @@ auto select = [](I8 m, V a, V b) { return (V)(((I8)a & m) | ((I8)b & ~m)); };
 EXPONENTIAL = """
 auto larger = [](V a, V b) { return a > b ? a : b; };
 auto smaller = [](V a, V b) { return a < b ? a : b; };
-auto scaled_exponential = [=](V x, const float s) {
+auto exponential_parts = [=](V x, const float s, V& power) {
     x = larger(V{} - 69.0f, x);
-    const V whole = x * 1.4426950408889634f + 12582912.0f;  // 1.5 * 2^23: what is left of the mantissa is an integer
-    const V f = x * 1.4426950408889634f - (whole - 12582912.0f);
+    // 1.5 * 2^23 and the bias of exponents: what is left of the mantissa is n + 127.
+    const V whole = x * 1.4426950408889634f + 12583039.0f;
+    const V f = x * 1.4426950408889634f - (whole - 12583039.0f);
     V p = f * (s * 1.326470879e-3f) + s * 9.671511471e-3f; p = p * f + s * 5.550733776e-2f;
     p = p * f + s * 2.402224210e-1f; p = p * f + s * 6.931469776e-1f; p = p * f + s;
-    return (V)((I8)p + ((I8)whole << 23));
+    power = (V)((I8)whole << 23);
+    return p;
 };
-auto exponential = [=](V x) { return scaled_exponential(x, 1.0f); };
+auto exponential = [=](V x) { V power; const V p = exponential_parts(x, 1.0f, power); return p * power; };
 """
 """larger(a, b) and smaller(a, b), one instruction each, which give b where either is NaN; and exponential(v), e^x for x
 up to 87 and e^-69 below -69: 2^n times a polynomial for 2^f on [-1/2, 1/2] (degree 5, by Lawson's iteration, 9.2e-8),
-3e-7 relative with rounding. scaled_exponential(v, s) has a constant s > 0 times that at no cost."""
+3e-7 relative with rounding. exponential_parts(v, s, power) returns the polynomial times a constant s and gives 2^n, so
+that s e^x + a is one instruction more."""
 
 
 def padded(width: int) -> int:

@@ -144,6 +144,18 @@ class NTBCConfig:
         """Size of the textures that are written, all mips."""
         return block_bytes(self.textures, self.width, self.height)
 
+    @property
+    def bytes(self) -> int:
+        """Size of the grids and networks as stored."""
+        total = 0
+        for model in self.models:
+            shape = self.shape(model)
+            pairs = [(model.texel, shape.texel)]
+            if self.endpoints == "network":
+                pairs.append((model.endpoint, shape.endpoint))
+            total += sum(grids.bytes + _network_bytes(net.inputs, net.hidden, net.outputs) for grids, net in pairs)
+        return total
+
     def planes(self, model: Model) -> tuple[Plane, ...]:
         """Return the planes that a model writes."""
         return tuple(self.textures[t].planes[p] for t, p in model.planes)
@@ -309,7 +321,8 @@ def configure(source, options: dict, preset: str | None = None) -> NTBCConfig:
 
             - ``mode``: ``conservative`` or ``aggressive``;
             - ``rate``: share of the bytes of the textures, all mips, that the file may take, between the modes' or
-              beyond; ``paper``: grids as fine and as deep as the paper's, whatever they take. Default: the mode's;
+              beyond; ``paper``: grids as fine and as deep as the paper's, whatever they take. Default: the mode's, or
+              the paper's grids where maps are so small that the networks alone take more;
             - ``bytes``: the same in bytes;
             - ``normals``: ``bc5`` or, as in the paper, ``bc1``; ``colours``: ``bc1`` or ``bc7``.
         preset: None; a length of training is the caller's.
@@ -356,7 +369,13 @@ def configure(source, options: dict, preset: str | None = None) -> NTBCConfig:
     every = [(t, p) for t, texture in enumerate(textures) for p in range(len(texture.planes))]
     colours = [(t, p) for t, p in every if textures[t].planes[p].format != "bc4"]
     groups = [every] if config["mode"] == "aggressive" else [colours, [pair for pair in every if pair not in colours]]
-    models = tuple(_model(group, config, rate) for group in groups if group)
+    try:
+        models = tuple(_model(group, config, rate) for group in groups if group)
+    except ValueError:
+        if config.get("rate") is not None or config.get("bytes") is not None:
+            raise
+        # Of small maps the networks alone take more than a mode's share: the paper's grids then, which cost little.
+        models = tuple(_model(group, config, None) for group in groups if group)
     return NTBCConfig(**{k: v for k, v in config.items() if k not in ("rate", "bytes")}, models=models)
 
 

@@ -38,8 +38,14 @@ class BlockMapData(MapData):
     def described(source, shape) -> str:
         """Return the table of maps, and a line on what is written and by how much."""
         written = ", ".join(f"{texture.name} {texture.format}" for texture in shape.textures)
-        finest = " and ".join(f"{m.texel.levels[-1][0]}×{m.texel.levels[-1][1]}" for m in shape.models)
-        return f"{source.table()}\nblocks: {written}: {shape.block_bytes} bytes; finest grids: {finest}"
+        finest = " and ".join(
+            f"{m.texel.levels[-1][0]}×{m.texel.levels[-1][1]} at {m.texel.bits} bits" for m in shape.models
+        )
+        share = f"{100 * shape.bytes / shape.block_bytes:.0f} %"
+        return (
+            f"{source.table()}\nblocks: {written}: {shape.block_bytes} bytes with mips"
+            f"\nfile: {shape.bytes} bytes, {share} of that; finest grids: {finest}"
+        )
 
     @staticmethod
     def trainer(module, source, shape, plan, device, *, checkpoint, **more):
