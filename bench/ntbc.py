@@ -146,6 +146,8 @@ def figure4(lab: Lab):
     for axes, key, which in zip(figure.subplots(1, 2), ("psnr_ratio", "ssim_ratio"), (1, 2), strict=True):
         for family, members in families.items():
             shown = sorted((100 * points[m]["share"], 100 * points[m][key], m) for m in members)
+            if not shown:
+                continue
             line = axes.plot([x for x, _, _ in shown], [y for _, y, _ in shown], "o-", label=family)
             for x, y, method in shown if family == "ntbc" else ():
                 text = method.removeprefix("ntbc ")
@@ -182,6 +184,8 @@ def figure6(lab: Lab):
         for (x, y), steps in zip(curve, lab.choice.lengths, strict=True):
             axes.annotate(str(steps), (x, y), textcoords="offset points", xytext=(5, -10), fontsize=8)
     axes.set(xlabel="training time [s]", ylabel=f"PSNR [dB], mean over maps of {Path(name).name}", xscale="log")
+    for axis in ("major", "minor"):
+        getattr(axes.xaxis, f"set_{axis}_formatter")("{x:g}")
     axes.grid(alpha=0.3, which="both")
     axes.legend()
     figure.savefig(lab.out / "figure6.png")
@@ -497,6 +501,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument(
         "--methods", type=names, default=Choice.methods, help=f"of {','.join(METHODS)}".replace("%", "%%")
     )
+    parser.add_argument("--rates", type=names, default=Choice.rates, help="further points of figure4")
     parser.add_argument("--crop", type=int, default=1024, help="side of the square; 0 for the whole set")
     parser.add_argument("--steps", type=int, help="of each fit; default: the fit's own")
     parser.add_argument("--seed", type=int, default=0)
@@ -505,7 +510,11 @@ def main(arguments: list[str] | None = None) -> int:
     # Threads of FLIP and torch that spin while they wait cost a busy machine many times what they gain.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     chosen = vars(parser.parse_args(arguments))
+    chosen["rates"] = tuple(name for name in chosen["rates"] if name)
     file = chosen.pop("json")
+    import warp
+
+    warp.config.log_level = warp.LOG_WARNING
     try:
         found = rows(device="cpu", quick=False, **{**chosen, "crop": chosen["crop"] or None})
         document = {"bench": "ntbc", "machine": machine(), "versions": versions(), "rows": _show(found)}

@@ -9,6 +9,9 @@ import pytest
 from warp_neumat.training import baselines
 from warp_neumat.training.baselines import METHODS, Baseline, pack, texture_bytes, upsample
 
+GAMES = [method for method in METHODS if method != "bc_same"]
+"""Those that pack maps by themselves."""
+
 
 def channel(map, encoding="linear"):
     return SimpleNamespace(map=map, encoding=encoding)
@@ -72,7 +75,7 @@ def test_formats_follow_the_rules(rng):
     channels = channels_of("base_color", "normal", "occlusion", "roughness", "metallic", "opacity")
     mips = chain(smooth(rng, 8, 8, len(channels)))
     names = ("normal", "base_color", "occlusion+roughness+metallic", "opacity")
-    formats = {m: [Baseline(m, channels, mips).formats[name] for name in names] for m in METHODS}
+    formats = {m: [Baseline(m, channels, mips).formats[name] for name in names] for m in GAMES}
     assert formats["bc_full"] == formats["bc_half"] == ["bc5", "bc1", "bc1", "bc1"]
     assert formats["bc7_full"] == ["bc5", "bc7", "bc7", "bc4"]
     assert formats["astc12"] == ["astc12"] * 4
@@ -191,7 +194,7 @@ def test_bc1_beats_blocks_made_without_search(rng):
     assert best < 0.8 * ((naive_bc1(pixels) - pixels) ** 2).mean()
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", GAMES)
 def test_every_level_keeps_its_maps(rng, method):
     """Sizes that are no multiple of a block, down to 1×1, and no channel lands in another's place."""
     for package in ("quicktex", "etcpak", "astc_encoder", "texture2ddecoder"):
@@ -240,3 +243,25 @@ def test_a_missing_encoder_names_the_extra(monkeypatch, rng, method, module, pac
     monkeypatch.setitem(sys.modules, module, None)  # importing it now fails
     with pytest.raises(ImportError, match=rf"{package}.* is not installed.*pip install 'warp-neumat\[bench\]'"):
         Baseline(method, channels_of("base_color"), chain(smooth(rng, 4, 4, 3)))
+
+
+def test_same_is_what_the_material_writes(rng):
+    names = [("base_color", c) for c in "rgba"] + [("normal", "x"), ("normal", "y"), ("height", "value")]
+    channels = [SimpleNamespace(map=name, component=c, encoding="linear") for name, c in names]
+    written = [
+        {"name": "base_color", "format": "bc3_srgb", "planes": [
+            {"format": "bc1", "channels": [0, 1, 2]}, {"format": "bc4", "channels": [3]}]},
+        {"name": "normal", "format": "bc5_unorm", "planes": [
+            {"format": "bc4", "channels": [4]}, {"format": "bc4", "channels": [5]}]},
+        {"name": "height", "format": "bc4_unorm", "planes": [{"format": "bc4", "channels": [6]}]},
+    ]  # fmt: skip
+    y, x = np.mgrid[:8, :12] / 12.0
+    picture = np.stack([0.5 + 0.3 * np.sin(4 * x + k * y) for k in range(7)], 2).astype(np.float32)
+    baseline = Baseline("bc_same", channels, [picture], written=written)
+    assert list(baseline.formats.values()) == ["bc1", "bc4", "bc5", "bc4"]
+    assert baseline.bytes == 2 * 3 * (8 + 8 + 16 + 8)
+    error = np.abs(baseline.level(0) - picture).max(axis=(0, 1))
+    assert error[3:].max() < 0.02
+    assert error[:3].max() < 0.12
+    with pytest.raises(ValueError, match="bc_same is for a material that writes BC textures"):
+        Baseline("bc_same", channels, [picture])

@@ -257,8 +257,8 @@ def evaluate(
     baselines: Annotated[
         str | None,
         typer.Option(
-            help="bcf, ntbc: what to compare with, of bc_full, bc_half, bc7_full, bc7_half, astc12, astc12_half, with "
-            "commas between them; default: all but the last."
+            help="bcf, ntbc: what to compare with, of bc_same (ntbc: the formats that it writes), bc_full, bc_half, "
+            "bc7_full, bc7_half, astc12, astc12_half, with commas between them; default: all but the last."
         ),
     ] = None,
     no_baselines: Annotated[

@@ -114,7 +114,7 @@ def _cpu_code(endpoint: Layout, texel: Layout, planes, naive: bool) -> str:
     {ends.declare(False)} {texels.declare(False)}
     int numbers[{PATCH}];    // the last patch repeats the last block
     for (int b = 0; b < {PATCH}; ++b) numbers[b] = {PATCH} * patch + b < count ? {PATCH} * patch + b : count - 1;
-    {ends.gather(ends.blocks)} {ends.forward()} {texels.gather(texels.texels)} {texels.forward()}
+    {ends.gather(ends.blocks)} {ends.forward(True)} {texels.gather(texels.texels)} {texels.forward(True)}
     for (int b = 0; b < {PATCH} && {PATCH} * patch + b < count; ++b) {{
         const long long block = numbers[b];
         const float* const ends = E_Y + b * {endpoint.rows[-1]};
@@ -271,16 +271,18 @@ def ntbc_blocks(
         metric = np.tile(np.eye(4, dtype=np.float32), (len(shape.planes), 1, 1))
     kind = arrays.kind_of(endpoint_grid, device)
     place = kind.device
-    taken = []
-    for name, value, size in (
-        ("endpoint_grid", endpoint_grid, shape.endpoint.grid_words),
-        ("endpoint_net", endpoint_net, shape.endpoint.weights),
-        ("texel_grid", texel_grid, shape.texel.grid_words),
-        ("texel_net", texel_net, shape.texel.weights),
+    wide, taken = place.is_cpu, []
+    for name, grid, net, network in (
+        ("endpoint", endpoint_grid, endpoint_net, shape.endpoint),
+        ("texel", texel_grid, texel_net, shape.texel),
     ):
-        array = arrays.take(value, name, (size,), wp.float32, kind)
-        # Warp's memory is aligned to cache lines, NumPy's is not: weights that straddle them cost a sixth of the speed.
-        taken.append(wp.clone(array) if name.endswith("net") else array)
+        taken.append(arrays.take(grid, f"{name}_grid", (network.grid_words,), wp.float32, kind))
+        weights = arrays.take(net, f"{name}_net", (network.weights,), wp.float32, kind)
+        if wide:
+            # Warp's memory is aligned to cache lines, NumPy's is not: weights that straddle them cost a sixth of the
+            # speed. So the copy is Warp's.
+            weights = wp.clone(wp.array(network.layout.folded(weights.numpy()), dtype=wp.float32, device=place))
+        taken.append(weights)
     tables = [
         arrays.take(net.table(), "table", (None, 3), wp.int32, kind).flatten() for net in (shape.endpoint, shape.texel)
     ]
@@ -288,7 +290,6 @@ def ntbc_blocks(
     sizes = [FORMATS[name][0] for name, _ in shape.planes]
     written = kind.empty((sum(sizes) * count,), wp.uint8)
     colours = kind.empty((count, shape.channels, 16) if predicted else (1, 1, 1), wp.float32)
-    wide = place.is_cpu
     own = _scratch(shape.endpoint.layout, shape.texel.layout)
     scratch = wp.empty(dispatch.worker_count() * own if wide else 1, dtype=wp.float32, device=place)
     dispatch.launch(

@@ -6,6 +6,9 @@ by themselves, normals as x and y, one-channel maps three by three in the order 
 they come (the paper's ``arm`` texture), linear and sRGB ones never mixed. Constant maps are no channels and cost
 nothing, as they cost the neural file nothing.
 
+``bc_same`` is for materials that are BC textures themselves (ntbc): the formats that it writes, from an encoder that
+sees the maps.
+
 Differs from the paper: a one-channel texture is BC1 by its rule, with grey in all three components, though BC4 keeps
 more at the same size; the ``bc7`` methods, BC7 for colours and triples, BC5 for pairs, BC4 for single maps, are there
 to show the best that block compression does, at up to twice the size. A normal map's ASTC blocks hold x and y as
@@ -29,6 +32,7 @@ ARM = ("occlusion", "roughness", "metallic")
 """One-channel maps that are packed first, in this order."""
 
 METHODS = {
+    "bc_same": ("same", 0),
     "bc_full": ("paper", 0),
     "bc_half": ("paper", 1),
     "bc7_full": ("bc7", 0),
@@ -88,25 +92,33 @@ class Baseline:
     """A texture set under one of :data:`METHODS`; a level is encoded and decoded when it is asked for.
 
     Args:
-        method: Name in :data:`METHODS`.
+        method: Name in :data:`METHODS`; ``bc_same`` needs ``written``.
         channels: The set's channels, each with ``map`` and ``encoding``.
         mips: The set's mips from the finest to 1×1, each (h, w, C) float32 in [0, 1], encoded.
         wrap: How the sampler sees past the edge when mip 0 is made from half resolution: repeat, clamp or mirror.
         astc_quality: 0 to 100, as :data:`THOROUGH`.
+        written: The textures of a material's config (name, format, planes), for ``bc_same``.
 
     Raises:
-        ValueError: If the method is unknown.
+        ValueError: If the method is unknown, or needs textures and has none.
         ImportError: If an encoder is missing; names the extra that brings it.
     """
 
-    def __init__(self, method: str, channels, mips, *, wrap: str = "repeat", astc_quality: int = THOROUGH):
+    def __init__(
+        self, method: str, channels, mips, *, wrap: str = "repeat", astc_quality: int = THOROUGH, written=None
+    ):
         if method not in METHODS:
             raise ValueError(f"method must be one of {', '.join(METHODS)}, got {method!r}")
+        if method == "bc_same" and written is None:
+            raise ValueError("bc_same is for a material that writes BC textures; name another baseline")
         rule, self._dropped = METHODS[method]
         self.method, self.mips, self.wrap = method, mips, wrap
         self._dropped = min(self._dropped, len(mips) - 1)
-        self.textures = pack(channels)
-        self.formats = {t.name: _RULES[rule](t.kind, len(t.channels)) for t in self.textures}
+        if method == "bc_same":
+            self.textures, self.formats = _written(written)
+        else:
+            self.textures = pack(channels)
+            self.formats = {t.name: _RULES[rule](t.kind, len(t.channels)) for t in self.textures}
         self._round_trips = {t.name: _round_trip(self.formats[t.name], t.kind, astc_quality) for t in self.textures}
 
     @property
@@ -127,6 +139,19 @@ class Baseline:
             part = self._round_trips[texture.name](stored[..., texture.channels])
             result[..., texture.channels] = upsample(part, height, width, self.wrap)
         return result
+
+
+def _written(textures) -> tuple[list[Texture], dict[str, str]]:
+    """Return the textures of an ntbc's config and their formats; BC3 counts as a BC1 and a BC4."""
+    found, formats = [], {}
+    for texture in textures:
+        family, planes = texture["format"].partition("_")[0], texture["planes"]
+        parts = planes if family == "bc3" else [{"channels": [k for plane in planes for k in plane["channels"]]}]
+        for n, part in enumerate(parts):
+            name = f"{texture['name']}.{n}" if n else texture["name"]
+            found.append(Texture(name, "blocks", tuple(part["channels"])))
+            formats[name] = part.get("format", family)
+    return found, formats
 
 
 def texture_bytes(format: str, sizes) -> int:

@@ -24,12 +24,13 @@ from warp_neumat.training.baselines import METHODS, THOROUGH, Baseline
 _CHUNK = 1 << 18  # samples that are evaluated at a time: 2K maps are never in memory as coordinates
 
 BASELINES = ("bc_full", "bc_half", "bc7_full", "bc7_half", "astc12")
-"""What :func:`eval_record` compares with."""
+"""What :func:`eval_record` compares with; a material that writes BC textures with ``bc_same`` first."""
 
 _COLUMN = 17  # characters of a method in the table: six fit into 120
 
 _TITLES = {
     "this": "this file",
+    "bc_same": "BC, same",
     "bc_full": "BC full",
     "bc_half": "BC half",
     "bc7_full": "BC7 full",
@@ -178,9 +179,12 @@ def eval_record(
     """
     check_match(texture_set, material)
     channels, pyramid = list(texture_set.channels), list(texture_set.mips())[:mips]
-    names = BASELINES if baselines is True else tuple(baselines or ())
-    wrap = material.header["config"].get("wrap", "repeat")
-    others = [Baseline(name, channels, pyramid, wrap=wrap, astc_quality=astc_quality) for name in names]
+    config = material.header["config"]
+    written = config["textures"] if material.kind == "ntbc" else None
+    every = BASELINES if written is None else ("bc_same", *BASELINES)
+    names = every if baselines is True else tuple(baselines or ())
+    more = {"wrap": config.get("wrap", "repeat"), "astc_quality": astc_quality, "written": written}
+    others = [Baseline(name, channels, pyramid, **more) for name in names]
     steps = 1 + len(others)
 
     def part(number: int, title: str):
