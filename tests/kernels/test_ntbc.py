@@ -43,7 +43,7 @@ def test_blocks_match_float64(shape, rng, device):
     with wp.ScopedDevice(device):
         written, shown = ntbc_blocks(shape, ROWS, COLUMNS, *arrays, metric=metric, predicted=True)
     ends, colours = predict(shape, arrays, ROWS, COLUMNS)
-    assert abs(shown - colours).max() < 2e-6  # worst seen 2e-7
+    assert abs(shown - colours).max() < 1e-5  # worst seen 7.3e-6, of selu's polynomial
     assert colours.std() > 0.05
     at = 0
     for plane, ((name, k), blocks) in enumerate(zip(shape.planes, written, strict=True)):
@@ -71,7 +71,7 @@ def test_every_grid_size_uses_one_kernel_and_fewer_blocks_are_a_mip(rng):
     arrays = random_model(shape, rng)
     for rows, columns in ((1, 1), (3, 5), (8, 2)):
         _, shown = ntbc_blocks(shape, rows, columns, *arrays, predicted=True)
-        assert abs(shown - predict(shape, arrays, rows, columns)[1]).max() < 2e-6
+        assert abs(shown - predict(shape, arrays, rows, columns)[1]).max() < 1e-5
 
 
 def test_same_bits_on_any_number_of_cores_and_from_torch(rng, monkeypatch):

@@ -36,7 +36,7 @@ def test_network_matches_float64(features, rng):
         shape, rows, columns, *random_network(shape.endpoint, rng), grids, net, predicted=True, device="cpu"
     )
     expected = reference.network(*reference.unpack(texel, grids, net), reference.positions(rows, columns, True))
-    assert abs(shown.reshape(-1, 1) - expected).max() < 1e-6
+    assert abs(shown.reshape(-1, 1) - expected).max() < 1e-5
     assert expected.std() > 0.02
 
 

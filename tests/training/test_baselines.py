@@ -229,7 +229,7 @@ def test_one_texel_set_has_no_half(rng):
 
 
 def test_mistakes_are_named(rng):
-    with pytest.raises(ValueError, match="method must be one of bc_full, bc_half, .*, got 'bc9'"):
+    with pytest.raises(ValueError, match="method must be one of bc_same, bc_full, bc_half, .*, got 'bc9'"):
         Baseline("bc9", channels_of("base_color"), chain(smooth(rng, 4, 4, 3)))
 
 
@@ -261,7 +261,7 @@ def test_same_is_what_the_material_writes(rng):
     assert list(baseline.formats.values()) == ["bc1", "bc4", "bc5", "bc4"]
     assert baseline.bytes == 2 * 3 * (8 + 8 + 16 + 8)
     error = np.abs(baseline.level(0) - picture).max(axis=(0, 1))
-    assert error[3:].max() < 0.02
+    assert error[3:].max() < 0.05
     assert error[:3].max() < 0.12
     with pytest.raises(ValueError, match="bc_same is for a material that writes BC textures"):
         Baseline("bc_same", channels, [picture])

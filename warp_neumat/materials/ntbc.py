@@ -32,8 +32,8 @@ class NTBC(BlockMaps):
     Args:
         tensors: For model i and each of its networks, ``model{i}.{endpoint|texel}.``: ``grid{l}``, uint8 of codes q
             (h, w, features) packed as :func:`~warp_neumat.io.asset.pack_bits` says, whose values are scale · (q − zero)
-            with ``scale`` (L,) float32 and ``zero`` (L,) int16 (NTBC Eq. 2). ``weight{n}`` (out, in) and ``bias{n}`` (out,)
-            float16 of the hidden layers and the output.
+            with ``scale`` (L,) float32 and ``zero`` (L,) int16 (NTBC Eq. 2). ``weight{n}`` (out, in) and ``bias{n}``
+            (out,) float16 of the hidden layers and the output.
         header: The asset's header; :mod:`~warp_neumat.materials.ntbc_config` says what its config holds.
         path: Where they come from, for messages.
         device: Warp device, which the networks run on too.
