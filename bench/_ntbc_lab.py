@@ -50,14 +50,16 @@ class Choice:
     """What to measure.
 
     ``crop`` is the side of the square taken from each set, None for all of it; ``steps`` those of each fit, None for
-    the fit's own; ``lengths`` the steps of Figure 6; ``rounds`` those of timings and ``workers`` the threads of a
-    training step; ``options`` go to every fit beside the method's; ``out`` keeps fitted files and plots.
+    the fit's own; ``modes`` and ``lengths`` the curves of Figure 6 and their steps, ``modes`` also those of Table 1;
+    ``rounds`` those of timings and ``workers`` the threads of a training step; ``options`` go to every fit beside the
+    method's; ``out`` keeps fitted files and plots.
     """
 
     only: tuple[str, ...] = TABLES[:-1]
     sets: tuple[str, ...] = SETS
     methods: tuple[str, ...] = tuple(METHODS)
     rates: tuple[str, ...] = tuple(RATES)
+    modes: tuple[str, ...] = ("conservative", "aggressive")
     lengths: tuple[int, ...] = (250, 500, 1000, 2000, 4000, 8000)
     crop: int | None = 1024
     steps: int | None = None

@@ -173,7 +173,7 @@ def figure6(lab: Lab):
     figure = Figure(figsize=(7, 5), dpi=120, layout="constrained")
     axes = figure.subplots()
     references = lab.references(name)
-    for mode in ("aggressive", "conservative"):
+    for mode in lab.choice.modes:
         curve = []
         for steps in lab.choice.lengths:
             row = lab.measure(name, {"mode": mode}, steps)
@@ -237,12 +237,12 @@ def table1(lab: Lab):
         from warp_neumat.io.texture_set import open_texture_set
 
         sources["BC1 only"] = open_texture_set({**tree, "maps": {m: f for m, f in tree["maps"].items() if m in wide}})
-    for mode in ("conservative", "aggressive"):
+    for mode in lab.choice.modes:
         for what, source in sources.items():
             config, pairs, _ = _trained(lab, source, mode)
             for row in _inference(config, pairs, lab.choice.rounds):
                 yield {"table": "table1", "set": name, "method": f"ntbc {mode}, {what}", **row}
-    for mode in ("conservative", "aggressive"):
+    for mode in lab.choice.modes:
         known = [other for other in lab.choice.sets if len(lab.source(other)[1].channels) == 7]
         chosen = known[0] if known else name
         material, _, _ = lab.fitted(chosen, {"mode": mode})
@@ -274,8 +274,9 @@ def _inference(config, pairs, rounds: int):
     written = [plane.numpy().reshape(-1, 8) for planes in ours() for plane in planes]
     formats = [format for _, planes, _, _ in models for format, _ in planes]
     peers, calls = {}, {"ours": ours}
-    for spelling in SPELLINGS:
-        for dtype, short in ((torch.float32, "fp32"), (torch.float16, "fp16")):
+    # float16 is emulated where the CPU has none: once, by one spelling.
+    for dtype, short, spellings in ((torch.float32, "fp32", SPELLINGS), (torch.float16, "fp16", SPELLINGS[1:])):
+        for spelling in spellings:
             nets = [Inference(p, planes, config.rows, config.columns, spelling, dtype) for p, planes, _, _ in models]
             for write, suffix in ((False, "networks"), (True, "networks and blocks")):
                 peers[short, suffix, spelling] = [(net, write) for net in nets]
@@ -283,7 +284,7 @@ def _inference(config, pairs, rounds: int):
         calls[key] = lambda nets=nets: [blocks for net, write in nets for blocks in net.run(write)]
     fast = {key: call for key, call in calls.items() if key == "ours" or key[0] == "fp32"}
     seconds = interleave(fast, rounds)
-    slow = {key: call for key, call in calls.items() if key not in fast}  # float16 is emulated where the CPU has none
+    slow = {key: call for key, call in calls.items() if key not in fast}
     seconds |= interleave(slow, 1, warmup=0)
     for short in ("fp32", "fp16"):
         for suffix in ("networks", "networks and blocks"):

@@ -308,3 +308,13 @@ def test_refusals():
 @pytest.mark.parametrize("name", ENCODERS)
 def test_kernel_compiles_for_cuda(name, tmp_path):
     check_cuda(make_fit_kernel(1, name), tmp_path)
+
+
+def test_two_colours_are_the_endpoints(rng):
+    """Their best real endpoints lie anywhere on the line, also out of the gamut; the nearest codes do not."""
+    codes = np.array([31, 63, 31], np.float32)
+    pairs = np.rint(rng.random((500, 2, 3)).astype(np.float32) * codes) / codes
+    which = rng.integers(0, 2, (500, 16))
+    pixels = pairs[np.arange(500)[:, None], which].reshape(-1, 4, 4, 3)
+    decoded = bc1_decode(bc1_encode(pixels))[..., :3] / np.float32(255)
+    assert np.abs(decoded - pixels).max() < 0.51 / 255

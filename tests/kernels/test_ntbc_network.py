@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tests.ntbc_models import random_network
+from tests.ntbc_models import predict, random_model, random_network
 from warp_neumat.kernels.ntbc import ModelShape, ntbc_blocks
 from warp_neumat.kernels.ntbc_network import NetworkShape
 from warp_neumat.reference import ntbc as reference
@@ -38,6 +38,15 @@ def test_network_matches_float64(features, rng):
     expected = reference.network(*reference.unpack(texel, grids, net), reference.positions(rows, columns, True))
     assert abs(shown.reshape(-1, 1) - expected).max() < 1e-5
     assert expected.std() > 0.02
+
+
+def test_one_or_two_outputs_past_whole_registers_match_float64(rng):
+    """9 and 18 outputs: the last ones are dot products."""
+    planes = (("bc1", 3), ("bc1", 3), ("bc4", 1), ("bc4", 1), ("bc4", 1))
+    shape = ModelShape(NetworkShape(((3, 3),), 18, hidden=(16,)), NetworkShape(((9, 7),), 9, hidden=(12,)), planes)
+    arrays = random_model(shape, rng)
+    _, shown = ntbc_blocks(shape, 3, 7, *arrays, predicted=True, device="cpu")
+    assert abs(shown - predict(shape, arrays, 3, 7)[1]).max() < 1e-5
 
 
 def test_level_as_fine_as_the_blocks_gives_each_its_own_vertex(rng):

@@ -7,8 +7,8 @@ entries 1, 2 and 3 determines the best real endpoints; they lessen the squared e
 + P(j) + P(k), P(n) is the sum of the first n texels, and det the determinant of the normal equations, which depends on
 i, j, k alone. So all 969 choices cost three additions and a square each. The sums also hold in the metric G = RᵀR, for
 R·P. It is done along the principal axis, then along the line found. The best endpoints are rounded to 565, compared
-with the pair of which a third gives the mean (which flat blocks want), refined by least squares, and at last their
-codes are stepped by one as long as the error lessens.
+with the line's first and last texel and with the pair of which a third gives the mean (which flat blocks want), refined
+by least squares, and at last their codes are stepped by one as long as the error lessens.
 """
 
 BC1 = r"""
@@ -113,6 +113,15 @@ struct FitBC1 : Lanes {
         for (int t = 0; t < 17; ++t) scale(sums + 3 * t, scaled + 3 * t);
     }
 
+    // The first and the last texel of the line: the best real endpoints of a block of few colours may leave the gamut.
+    CUDA_CALLABLE void keep_extremes() {
+        F a[3], b[3];
+        for (int c = 0; c < 3; ++c) {
+            a[c] = mean[c] + sums[3 + c]; b[c] = mean[c] + sums[48 + c] - sums[45 + c];
+        }
+        keep_rounded(a, b);
+    }
+
     // gains: 1 / det of all i <= j <= k in order, 0 where it is 0. Keeps the best endpoints and gives their difference.
     CUDA_CALLABLE void cluster(const float* gains, const int* cuts, F* axis) {
         F best = zero(), place = zero();
@@ -195,7 +204,7 @@ struct FitBC1 : Lanes {
         principal(y, own);
         for (int c = 0; c < 3; ++c) axis[c] = R[c] * own[0] + R[4 + c] * own[1] + R[8 + c] * own[2];
         keep_flat();
-        for (int n = 0; n < 2; ++n) { sort(axis); cluster(gains, cuts, axis); refine(); refine(); }
+        for (int n = 0; n < 2; ++n) { sort(axis); keep_extremes(); cluster(gains, cuts, axis); refine(); refine(); }
         nudge(rounds);
         refine();
     }

@@ -19,7 +19,7 @@ from warp_neumat.kernels import arrays, dispatch
 from warp_neumat.kernels.block_pack import pack_code
 from warp_neumat.kernels.ntbc_network import HEAD, SELU_ALPHA, SELU_SCALE, TAP, Layout, NetworkCode, NetworkShape
 
-PATCH = 8
+PATCH = 16
 """Blocks that one CPU thread owns."""
 
 FORMATS = {"bc1": (8, 4, (3,)), "bc4": (8, 8, (1,)), "bc7": (16, 16, (3, 4))}
@@ -261,8 +261,8 @@ def ntbc_blocks(
 
     Raises: ValueError: If a shape or device differs.
 
-    Error: predicted colours 1e-5, a 390th of a step of 8 bits; blocks decode as those packed in float64 but for less than 5 in 1000; held by
-    test_blocks_match_float64.
+    Error: predicted colours 1e-5, a 390th of a step of 8 bits; blocks decode as those packed in float64 but for
+    less than 5 in 1000; held by test_blocks_match_float64.
     """
     if rows < 1 or columns < 1:
         raise ValueError(f"rows and columns must be at least 1, got {rows} and {columns}")

@@ -33,8 +33,8 @@ __all__ = ["DATA", "DEFAULT_STEPS", "NTBC", "NTBCConfig", "PRESETS", "VERSION", 
 DATA = "block_maps"
 VERSION = 1
 
-DEFAULT_STEPS = 4000
-"""Optimiser steps of a fit where the caller names none. Paper: 20,000."""
+DEFAULT_STEPS = 8000
+"""Optimiser steps of each model where the caller names none. Paper: 20,000."""
 
 PRESETS: dict = {}
 

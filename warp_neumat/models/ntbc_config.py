@@ -121,10 +121,10 @@ class NTBCConfig:
     """T of the softmax of Eq. 13."""
     joint: float = 0.5
     """Share of the steps, the last ones, in which both networks see what they write together. Paper: 0."""
-    quantised: float = 0.3
+    quantised: float = 0.5
     """Share of the steps, the last ones, with grids rounded as they are stored. Paper: 1/11, "10 % more steps"."""
-    rates: tuple[float, float] = (0.01, 0.005)
-    """Learning rates of grids and of networks at the beginning."""
+    rates: tuple[float, float] = (0.01, 0.01)
+    """Learning rates of grids and of networks at the beginning. Paper: 0.01, 0.005."""
 
     def __post_init__(self):
         _check(self)

@@ -26,7 +26,7 @@ class BlockMapData(MapData):
     """What a fit does with sources of kind ``block_maps``: folders of PBR textures, as for ``maps``."""
 
     UNIT = 8
-    BATCHES = 128
+    BATCHES = 256
     """Steps of an epoch, which the batch is chosen for: so every texture is seen equally often."""
 
     @classmethod
