@@ -137,7 +137,7 @@ def figure4(lab: Lab):
     families = {
         "naive": [m for m in points if m.startswith("naive")],
         "ntbc": [m for m in points if m.startswith("ntbc") and not m.endswith("grids")],
-        "ntbc, paper's grids": [m for m in points if m.endswith("grids")],
+        "as the paper": [m for m in points if m.startswith("as the paper")],
         "bc ours": ["bc ours"],
     }
     from matplotlib.figure import Figure

@@ -227,7 +227,8 @@ def bc1_encode(pixels, *, metric=None, out=None):
         TypeError: If ``pixels`` are not floats.
         ValueError: If their shape, ``metric`` or ``out`` differs.
     Error: on real maps PSNR is from 0.15 dB below to 3.3 dB above that of quicktex at level 18 with four colours, and
-        from 0.5 dB below to 0.9 dB above with three; held by test_bc1_beside_quicktex_and_etcpak. Speed on one core: 84 times quicktex's.
+        from 0.5 dB below to 0.9 dB above with three; held by test_bc1_beside_quicktex_and_etcpak. Speed on one core:
+        84 times quicktex's.
     """
     return _encode("bc1", pixels, metric, out)
 
