@@ -271,6 +271,9 @@ BAD = {
     r"config.models\[1\].endpoint.features: must be one of 1, 2, 4, 8, got 3": spoil(
         lambda t, c: c["models"][1]["endpoint"].update(features=3)
     ),
+    r"config.models\[0\]: must write fewer than 2\^31 numbers, got .* at 65535x65535": spoil(
+        lambda t, c: c.update(width=65535, height=65535)
+    ),
     "model0.texel.grid2: missing": spoil(lambda t, c: t.pop("model0.texel.grid2")),
     r"model1.endpoint.grid0: must have shape \(32,\), got \(30,\)": spoil(
         lambda t, c: t.update({"model1.endpoint.grid0": t["model1.endpoint.grid0"][:30]})

@@ -1,6 +1,8 @@
 """Training of NTBC on a small set: learning, variants, interruption, and that what was trained is what is shipped."""
 
+import dataclasses
 import functools
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,13 +10,13 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from tests.tiny_maps import tiny_maps  # noqa: E402
-from warp_neumat.io.asset import FormatError  # noqa: E402
+from warp_neumat.io.asset import FormatError, unpack_bits  # noqa: E402
 from warp_neumat.io.block_formats import from_blocks  # noqa: E402
-from warp_neumat.io.texture_set import open_texture_set  # noqa: E402
+from warp_neumat.io.texture_set import Channel, open_texture_set  # noqa: E402
 from warp_neumat.kernels.bc1 import bc1_decode  # noqa: E402
 from warp_neumat.materials import load  # noqa: E402
 from warp_neumat.materials.ntbc import NTBC  # noqa: E402
-from warp_neumat.models.ntbc import build, configure  # noqa: E402
+from warp_neumat.models.ntbc import build, configure, layers  # noqa: E402
 from warp_neumat.training.block_maps import BlockMapData, reference_endpoints  # noqa: E402
 from warp_neumat.training.fit import checkpoint_path, fit  # noqa: E402
 from warp_neumat.training.loop import Plan  # noqa: E402
@@ -75,6 +77,20 @@ def test_blocks_come_near_the_maps(maps, options):
     assert facts["steps"] == 400 * len(trainer.model.pairs)
 
 
+@pytest.mark.parametrize("colours", ["bc1", "bc7"])
+def test_colours_with_alpha(maps, colours):
+    """A map of four channels is BC3 or BC7, and each channel comes back where it was."""
+    alpha = Channel("base_color", "a", "srgb")
+    pixels = np.concatenate([maps.pixels[..., :3], 1.0 - maps.pixels[..., 5:]], axis=2)
+    names = {"name": "alpha", "width": 64, "height": 64, "constants": {}}
+    four = SimpleNamespace(**names, channels=(*maps.channels[:3], alpha), pixels=pixels, mips=lambda: [pixels])
+    assert [c.component for c in four.channels] == list("rgba")
+    trainer = make(four, steps=300, colours=colours)
+    assert trainer.config.textures[0].format == ("bc3_srgb" if colours == "bc1" else "bc7_srgb")
+    trainer.run()
+    assert error(four, trainer)["base_color"] < 2e-3
+
+
 def test_colours_beat_weights(maps):
     found = {}
     for variant in ("ntbc", "naive"):
@@ -103,7 +119,7 @@ def test_the_same_seed_gives_the_same_file(maps):
     assert not all(np.array_equal(runs[0][name], runs[2][name]) for name in runs[0])
 
 
-@pytest.mark.parametrize("stop", [(0, 20), (0, 45), (1, 58)])
+@pytest.mark.parametrize("stop", [(0, 20), (0, 30), (1, 31), (1, 58)])
 @pytest.mark.parametrize("variant", ["ntbc", "naive"])
 def test_a_resumed_fit_equals_an_uninterrupted_one(maps, tmp_path, stop, variant):
     options = {"mode": "conservative", "endpoints": "network", "variant": variant}
@@ -127,6 +143,28 @@ def test_a_resumed_fit_equals_an_uninterrupted_one(maps, tmp_path, stop, variant
     second.run()
     for name, value in tensors(whole).items():
         np.testing.assert_array_equal(tensors(second)[name], value, err_msg=name)
+
+
+@pytest.mark.parametrize("bits", [4, 5, 7])
+def test_what_the_last_step_read_is_what_is_stored(maps, bits, monkeypatch):
+    config = configure(maps, {"mode": "aggressive", "rate": "paper", "endpoints": "network"})
+    grids = dataclasses.replace(config.models[0].texel, bits=bits)
+    config = dataclasses.replace(config, models=(dataclasses.replace(config.models[0], texel=grids),))
+    pixels, kept = maps.mips()[0], {}
+    trainer = NTBCTrainer(build(config, 0), pixels, lambda planes: reference_endpoints(planes, pixels), Plan(40, 64))
+    made = trainer._optimisers
+    monkeypatch.setattr(trainer, "_optimisers", lambda pair: kept.update(made(pair)) or kept)
+    trainer.run()
+    stored, shape = tensors(trainer), trainer.model.pairs[0].shape
+    for name, network, depth in (("texel", shape.texel, bits), ("endpoint", shape.endpoint, 8)):
+        key, found = f"model0.{name}", []
+        for n, size in enumerate(network.grid_sizes):
+            codes = unpack_bits(stored[f"{key}.grid{n}"], depth, size).astype(np.float32)
+            found.append((codes - np.float32(stored[f"{key}.zero"][n])) * stored[f"{key}.scale"][n])
+        np.testing.assert_array_equal(np.concatenate(found), kept[f"{name}_grid"].used.numpy())
+        for n, (weight, bias) in enumerate(layers(network, kept[f"{name}_net"].used)):
+            np.testing.assert_array_equal(stored[f"{key}.weight{n}"].astype(np.float32), weight.numpy())
+            np.testing.assert_array_equal(stored[f"{key}.bias{n}"].astype(np.float32), bias.numpy())
 
 
 def test_a_checkpoint_of_other_settings_is_refused(maps, tmp_path):

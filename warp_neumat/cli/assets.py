@@ -85,7 +85,10 @@ def fit(
         int | None,
         typer.Option("--bytes", min=1, help="Sizes of the feature textures, or of an ntbc's grids, by bytes to spend."),
     ] = None,
-    steps: Annotated[int | None, typer.Option(help="Training steps; default: the model's and the preset's.")] = None,
+    steps: Annotated[
+        int | None,
+        typer.Option(help="Training steps (ntbc: of each network pair); default: the model's and the preset's."),
+    ] = None,
     seed: Annotated[int, typer.Option(help="Same seed, same file.")] = 0,
     resume: Annotated[bool, typer.Option(help="Go on where an interrupted fit of the same output stopped.")] = False,
     size: Annotated[

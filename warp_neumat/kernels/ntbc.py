@@ -22,6 +22,9 @@ from warp_neumat.kernels.ntbc_network import HEAD, SELU_ALPHA, SELU_SCALE, TAP, 
 PATCH = 16
 """Blocks that one CPU thread owns."""
 
+MOST_NUMBERS = 1 << 31
+"""Texels of whole blocks times components that a model must stay below, to number its colours in 31 bits."""
+
 FORMATS = {"bc1": (8, 4, (3,)), "bc4": (8, 8, (1,)), "bc7": (16, 16, (3, 4))}
 """Bytes of a block, entries of its palette, and how many channels it can hold."""
 

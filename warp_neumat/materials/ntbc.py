@@ -136,18 +136,20 @@ def _network(tensors, config, name: str, facts: dict, outputs: int, path):
     shape = NetworkShape(sizes, outputs, tuple(config["hidden"]), features)
     scale = expect(tensors, f"{name}.scale", "float32", (len(sizes),), path)
     zero = expect(tensors, f"{name}.zero", "int16", (len(sizes),), path)
-    grids = []
-    for n, (w, h) in enumerate(sizes):
-        count = w * h * features
+    grids = np.empty(shape.grid_words, np.float32)
+    for n, (at, count) in enumerate(zip(shape.grid_offsets, shape.grid_sizes, strict=True)):
         stored = expect(tensors, f"{name}.grid{n}", "uint8", (packed_bytes(count, bits),), path)
-        grids.append((unpack_bits(stored, bits, count).astype(np.float32) - np.float32(zero[n])) * scale[n])
+        level = grids[at : at + count]
+        level[:] = unpack_bits(stored, bits, count)
+        level -= np.float32(zero[n])
+        level *= scale[n]
     net, widths = np.zeros(shape.weights, np.float32), [features * len(sizes), *config["hidden"], outputs]
     for n, (i, o) in enumerate(zip(widths[:-1], widths[1:], strict=True)):
         bias_at, weight_at = shape.offsets[n]
         net[bias_at : bias_at + o] = expect(tensors, f"{name}.bias{n}", "float16", (o,), path)
         matrix = net[weight_at : weight_at + shape.rows[n] * shape.rows[n + 1]].reshape(shape.rows[n], -1)
         matrix[:i, :o] = expect(tensors, f"{name}.weight{n}", "float16", (o, i), path).T
-    return shape, np.concatenate(grids), net
+    return shape, grids, net
 
 
 # ---- blocks ----------------------------------------------------------------------------------------------------------

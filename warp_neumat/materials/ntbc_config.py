@@ -12,8 +12,9 @@ height) of its grids, coarsest first, ``features`` a vertex (2 where it is not s
 import dataclasses
 
 from warp_neumat.io.asset import FormatError
-from warp_neumat.io.block_formats import FORMATS
+from warp_neumat.io.block_formats import FORMATS, grid
 from warp_neumat.kernels.filter import MOST_MIPS
+from warp_neumat.kernels.ntbc import MOST_NUMBERS
 from warp_neumat.materials.map_config import AGAIN, check_maps, check_object, one_of, whole_number
 
 MODES = ("conservative", "aggressive")
@@ -84,7 +85,19 @@ def check_ntbc(config, path) -> dict:
     for n, width in enumerate(hidden):
         whole_number({"width": width}, "width", 1, 512, path, f"config.hidden[{n}]")
     _check_models(config, path)
+    _check_numbers(config, path)
     return config
+
+
+def _check_numbers(config: dict, path) -> None:
+    """Check that no model has more colours than can be numbered, before anything of that size is allocated."""
+    rows, columns = grid(config["width"], config["height"])
+    components = {(p.texture, p.number): p.components for p in planes_of(config)}
+    for i, model in enumerate(config["models"]):
+        count = 16 * rows * columns * sum(components[tuple(pair)] for pair in model["planes"])
+        if count >= MOST_NUMBERS:
+            rule = f"must write fewer than 2^31 numbers, got {count} at {config['width']}x{config['height']}"
+            raise FormatError(path, f"config.models[{i}]", rule, AGAIN)
 
 
 def planes_of(config: dict) -> list[Plane]:

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import math
 
 from warp_neumat.io.asset import packed_bytes
 from warp_neumat.io.block_formats import mip_bytes, mip_limit
+from warp_neumat.kernels.ntbc import MOST_NUMBERS
 from warp_neumat.kernels.ntbc_network import NetworkShape
 from warp_neumat.kernels.ntbc_train import StepShape
 
@@ -28,6 +30,9 @@ PAPER = {"texel": 1 / 2, "endpoint": 1 / 4}
 
 LEAST_BITS = 4
 """Of a feature where every texel has a vertex of its own; below, coarser grids of 8 bits are worth more."""
+
+FINEST = 0.71
+"""Of grids that have no vertex for every texel: beyond, four bits a feature buy one."""
 
 ENDPOINT_SHARE = 0.25
 """Of the bytes of a model's grids, what those of the endpoint network may take at most."""
@@ -173,6 +178,10 @@ class NTBCConfig:
         )
 
 
+def _within(value, low: float, high: float) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and low <= value <= high
+
+
 def _check(config: NTBCConfig) -> None:
     rules = {
         "mode": (config.mode in MODES, f"must be {' or '.join(MODES)}"),
@@ -180,10 +189,13 @@ def _check(config: NTBCConfig) -> None:
         "endpoints": (config.endpoints in ("network", "fitted"), "must be network or fitted"),
         "metric": (config.metric in ("rgb", "luma"), "must be rgb or luma"),
         "wrap": (config.wrap in ("repeat", "clamp", "mirror"), "must be repeat, clamp or mirror"),
-        "temperature": (1e-4 <= config.temperature <= 1.0, "must lie in 0.0001 … 1"),
-        "joint": (0.0 <= config.joint <= 1.0, "must lie in 0 … 1"),
-        "quantised": (0.0 < config.quantised <= 1.0, "must be above 0, at most 1"),
-        "rates": (len(config.rates) == 2 and all(0 < r <= 1 for r in config.rates), "must be two numbers in 0 … 1"),
+        "temperature": (_within(config.temperature, 1e-4, 1.0), "must lie in 0.0001 … 1"),
+        "joint": (_within(config.joint, 0.0, 1.0), "must lie in 0 … 1"),
+        "quantised": (_within(config.quantised, 1e-6, 1.0), "must be above 0, at most 1"),
+        "rates": (
+            len(config.rates) == 2 and all(_within(r, 1e-6, 1.0) for r in config.rates),
+            "must be two numbers in 0 … 1",
+        ),
         "hidden": (
             1 <= len(config.hidden) <= 4 and all(h in range(8, 129, 8) for h in config.hidden),
             "must be one to four multiples of 8 up to 128",
@@ -219,38 +231,55 @@ def _network_bytes(inputs: int, hidden: tuple[int, ...], outputs: int) -> int:
     return sum(2 * (a * b + b) for a, b in zip(widths[:-1], widths[1:], strict=True))
 
 
-def _grids(width: int, height: int, fraction: float, bits: int = 8) -> Grids:
-    return Grids(levels(width, height, fraction), 2, bits)
+@dataclasses.dataclass(frozen=True)
+class _Budget:
+    """What the grids and weights of a network may take, and what decides that."""
 
+    size: tuple[int, int]
+    """Of the texture in whole blocks, which is what networks see."""
+    outputs: int
+    hidden: tuple[int, ...]
+    bytes: float
 
-def _texel_grids(width: int, height: int, budget: float) -> Grids | None:
-    """Return the grids of a texel network that are worth most in ``budget`` bytes; None if not even the smallest fit.
+    def grids(self, fraction: float, bits: int = 8) -> Grids:
+        """Return grids whose finest level is ``fraction`` of the texture."""
+        return Grids(levels(*self.size, fraction), 2, bits)
 
-    A vertex for every texel, with as many bits as fit, if that is at least :data:`LEAST_BITS`; else as fine as fits at
-    8 bits (measured; ``docs/papers.md``).
-    """
-    for bits in range(8, LEAST_BITS - 1, -1):
-        full = _grids(width, height, 1.0, bits)
-        if full.bytes <= budget:
-            return full
-    return _finest(width, height, budget, 0.71)
+    def cost(self, grids: Grids) -> int:
+        """Return the bytes of grids and weights."""
+        return grids.bytes + _network_bytes(2 * len(grids.levels), self.hidden, self.outputs)
 
+    def least(self) -> Grids:
+        """Return the smallest grids."""
+        return self.grids(min(1.0, COARSEST / max(self.size)))
 
-def _finest(width: int, height: int, budget: float, most: float) -> Grids | None:
-    """Return the finest 8-bit grids of at most ``most`` of the resolution that fit into ``budget`` bytes."""
-    low, high, found = min(most, COARSEST / max(width, height)), most, None
-    for number in range(32):  # bisection, because bytes grow with the fraction; the ends first
-        fraction = (high, low)[number] if number < 2 else 0.5 * (low + high)
-        grids = _grids(width, height, fraction)
-        if grids.bytes <= budget:
-            found, low = grids, fraction
-            if fraction == most:
-                break
-        else:
-            high = fraction
-            if number == 1:
-                break
-    return found
+    def finest(self, most: float) -> Grids | None:
+        """Return the finest 8-bit grids that fit, up to a fraction of ``most``; None if none does."""
+        low, high = min(most, COARSEST / max(self.size)), most
+        if self.cost(self.grids(most)) <= self.bytes:
+            return self.grids(most)
+        found = self.grids(low)
+        if self.cost(found) > self.bytes:
+            return None
+        for _ in range(32):  # bytes grow with the fraction
+            middle = 0.5 * (low + high)
+            grids = self.grids(middle)
+            if self.cost(grids) <= self.bytes:
+                found, low = grids, middle
+            else:
+                high = middle
+        return found
+
+    def best(self) -> Grids | None:
+        """Return the grids of a texel network that are worth most; None if not even the smallest fit.
+
+        A vertex for every texel, with as many bits as fit, if that is at least :data:`LEAST_BITS`; else as fine as fits
+        at 8 bits (measured; ``docs/papers.md``).
+        """
+        for bits in range(8, LEAST_BITS - 1, -1):
+            if self.cost(self.grids(1.0, bits)) <= self.bytes:
+                return self.grids(1.0, bits)
+        return self.finest(FINEST)
 
 
 def _model(planes, config: dict, rate: float | None) -> Model:
@@ -258,30 +287,40 @@ def _model(planes, config: dict, rate: float | None) -> Model:
 
     Without a rate grids are as fine as the paper's, whatever that takes.
     """
-    width, height = config["width"], config["height"]
-    # What the networks see is whole blocks.
-    padded_size = 4 * -(-width // 4), 4 * -(-height // 4)
+    width, height, hidden = config["width"], config["height"], config["hidden"]
     members = [config["textures"][t].planes[p] for t, p in planes]
     numbers = sum(plane.components for plane in members)
-    fitted, hidden = config["endpoints"] == "fitted", config["hidden"]
-    outputs = len(members) if config["variant"] == "naive" else numbers
-    if rate is None:
-        texel, endpoint = (_grids(*padded_size, PAPER[name]) for name in ("texel", "endpoint"))
-        return Model(tuple(planes), texel, endpoint)
-    blocks = sum(mip_bytes(f"{plane.format}_unorm", width, height, m) for plane in members for m in _mips(config))
-    budget = rate * blocks - _network_bytes(2 * 8, hidden, outputs)
-    endpoint = _grids(*padded_size, 1 / 16)
-    if not fitted:
-        budget -= _network_bytes(2 * 7, hidden, 2 * numbers)
-        endpoint = _finest(*padded_size, ENDPOINT_SHARE * budget, PAPER["endpoint"])
-        budget -= endpoint.bytes if endpoint else 0
-    texel = _texel_grids(*padded_size, budget) if endpoint else None
-    if texel is None:
+    size = 4 * -(-width // 4), 4 * -(-height // 4)
+    if size[0] * size[1] * numbers >= MOST_NUMBERS:
         raise ValueError(
-            f"rate {rate:g} of {blocks} bytes is too little for the networks of {width}x{height}; "
-            "raise it, or fit to a larger part of the maps"
+            f"{width}x{height} with {numbers} channels in one model has {size[0] * size[1] * numbers} numbers, of at "
+            f"most {MOST_NUMBERS - 1}; use mode=conservative, or fit to a part of the maps"
+        )
+    ends = _Budget(size, 2 * numbers, hidden, 0.0)
+    texels = _Budget(size, len(members) if config["variant"] == "naive" else numbers, hidden, 0.0)
+    if rate is None:
+        return Model(tuple(planes), texels.grids(PAPER["texel"]), ends.grids(PAPER["endpoint"]))
+    blocks = sum(mip_bytes(f"{plane.format}_unorm", width, height, m) for plane in members for m in _mips(config))
+    budget, fitted = rate * blocks, config["endpoints"] == "fitted"
+    weights = 0 if fitted else ends.cost(ends.least()) - ends.least().bytes
+    spent = weights + texels.cost(texels.least()) - texels.least().bytes
+    endpoint = ends.least()
+    if not fitted:
+        share = ENDPOINT_SHARE * (budget - spent)
+        endpoint = dataclasses.replace(ends, bytes=weights + share).finest(PAPER["endpoint"])
+        budget -= ends.cost(endpoint) if endpoint else 0
+    texel = dataclasses.replace(texels, bytes=budget).best() if endpoint else None
+    if texel is None:
+        least = texels.cost(texels.least()) + (0 if fitted else ends.cost(ends.least()) / ENDPOINT_SHARE)
+        raise ValueError(
+            f"{_asked(config, rate)} is too little for {width}x{height}: the networks alone take {spent} of {blocks} "
+            f"bytes; give at least rate={math.ceil(100 * least / blocks) / 100:g}, or fit to a larger part of the maps"
         )
     return Model(tuple(planes), texel, endpoint)
+
+
+def _asked(config: dict, rate: float) -> str:
+    return f"rate={rate:g}" if config.get("bytes") is None else f"bytes={config['bytes']}"
 
 
 def _mips(config: dict) -> range:

@@ -214,7 +214,7 @@ def _round_trip(format: str, kind: str, astc_quality: int):
         padded, size = _rgba8(pixels)
         data = decode(encode(padded, *size), *size)
         bgra = np.frombuffer(data, np.uint8).reshape(size[1], size[0], 4)
-        return bgra[:height, :width, 2::-1][..., :count].astype(np.float32) / np.float32(255)
+        return bgra[:height, :width, [2, 1, 0, 3]][..., :count].astype(np.float32) / np.float32(255)
 
     return round_trip
 

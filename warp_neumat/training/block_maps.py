@@ -18,6 +18,7 @@ from warp_neumat.kernels.block_fit import (
 )
 from warp_neumat.materials.ntbc import NTBC as NTBCMaterial
 from warp_neumat.models.ntbc import plane_colours
+from warp_neumat.models.ntbc_config import MODES
 from warp_neumat.training.maps import MapData, mean_psnr
 from warp_neumat.training.ntbc_loop import NTBCTrainer
 
@@ -44,7 +45,7 @@ class BlockMapData(MapData):
         share = f"{100 * shape.bytes / shape.block_bytes:.0f} %"
         return (
             f"{source.table()}\nblocks: {written}: {shape.block_bytes} bytes with mips"
-            f"\nfile: {shape.bytes} bytes, {share} of that; finest grids: {finest}"
+            f"\nfile: {shape.bytes} bytes, {share} of that; finest grids: {finest}{_note(shape)}"
         )
 
     @staticmethod
@@ -54,7 +55,7 @@ class BlockMapData(MapData):
             raise ValueError(
                 f"device must be cpu: the fused training of ntbc has no {device.type} version; leave it out"
             )
-        pixels = source.mips()[0]
+        pixels = source.pixels
         return NTBCTrainer(
             module.build(shape, plan.seed),
             pixels,
@@ -72,6 +73,12 @@ class BlockMapData(MapData):
         header["maps"] = {"files": source.files, "notes": list(source.notes)}
         psnr = mean_psnr(source.mips(), material.encoded)
         return tensors, header, {"psnr": psnr, "block_bytes": material.block_bytes}
+
+
+def _note(shape) -> str:
+    if shape.bytes <= max(MODES.values()) * shape.block_bytes:
+        return ""
+    return "\nnote: networks pay for themselves on larger maps; of small ones take many together, or store the blocks"
 
 
 def reference_endpoints(planes, pixels: np.ndarray) -> torch.Tensor:

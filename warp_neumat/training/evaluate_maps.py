@@ -24,7 +24,10 @@ from warp_neumat.training.baselines import METHODS, THOROUGH, Baseline
 _CHUNK = 1 << 18  # samples that are evaluated at a time: 2K maps are never in memory as coordinates
 
 BASELINES = ("bc_full", "bc_half", "bc7_full", "bc7_half", "astc12")
-"""What :func:`eval_record` compares with; a material that writes BC textures with ``bc_same`` first."""
+"""What :func:`eval_record` compares with."""
+
+BASELINES_OF_BLOCKS = ("bc_same", "bc_full", "bc_half", "bc7_half", "astc12")
+"""The same for a material that writes BC textures itself."""
 
 _COLUMN = 17  # characters of a method in the table: six fit into 120
 
@@ -181,7 +184,7 @@ def eval_record(
     channels, pyramid = list(texture_set.channels), list(texture_set.mips())[:mips]
     config = material.header["config"]
     written = config["textures"] if material.kind == "ntbc" else None
-    every = BASELINES if written is None else ("bc_same", *BASELINES)
+    every = BASELINES if written is None else BASELINES_OF_BLOCKS
     names = every if baselines is True else tuple(baselines or ())
     more = {"wrap": config.get("wrap", "repeat"), "astc_quality": astc_quality, "written": written}
     others = [Baseline(name, channels, pyramid, **more) for name in names]

@@ -71,6 +71,8 @@ class NTBCTrainer:
         self.last_loss = math.nan
         self._number = self._step = self._count = 0
         self._elapsed = {"total": 0.0, "model": 0.0}
+        self._rounded = False  # whether the last step left grids rounded
+        self._batch = plan.batch
         self._pending: dict | None = None
         self._parts = min(MOST_PARTS, dispatch.worker_count())
 
@@ -79,12 +81,13 @@ class NTBCTrainer:
         self._last_tick = self._last_save = time.monotonic()
         while self._number < len(self.model.pairs):
             self._train(self.model.pairs[self._number])
-            self._number, self._step = self._number + 1, 0
+            self._number, self._step, self._rounded = self._number + 1, 0, False
             self._elapsed["model"] = 0.0
         return {
             "seconds": round(self._elapsed["total"], 2),
             "steps": self._count,
-            "batch": self.plan.batch,
+            "models": len(self.model.pairs),
+            "batch": self._batch,
             "seed": self.plan.seed,
             "threads": self._parts,
             "budget_seconds": self.plan.budget_seconds,
@@ -98,7 +101,8 @@ class NTBCTrainer:
         planes = config.planes(pair.model)
         self._report("looking at the reference")
         colours = block_colours(planes, self.pixels)
-        count, batch = len(colours), min(self.plan.batch, 8 * (len(colours) // 8) or 8)
+        count = len(colours)
+        batch = self._batch = min(self.plan.batch, 8 * (count // 8) or 8)
         endpoints = torch.zeros(count, 2 * colours.shape[1])
         if not naive and config.endpoints == "network":
             endpoints = self.reference(planes)
@@ -127,6 +131,7 @@ class NTBCTrainer:
                 still = frozen and name.startswith("texel")
                 rate = 0.0 if still else config.rates[0 if name.endswith("grid") else 1] * scale
                 optimiser.step(rate, self._step, rounded)
+            self._rounded = rounded
             if self._count % 50 == 0 or self._step == 1:
                 self._note(step, naive)
             if self.watch and self._count % 100 == 0:
@@ -184,7 +189,8 @@ class NTBCTrainer:
             tensors |= {f"optimiser.{name}.first": optimiser.first, f"optimiser.{name}.second": optimiser.second}
         loss = self.last_loss if math.isfinite(self.last_loss) else None
         state = {"number": self._number, "step": self._step, "count": self._count, "elapsed": self._elapsed}
-        checkpoint.save(self.checkpoint, tensors, {**state, "loss": loss}, self._facts())
+        state |= {"rounded": self._rounded, "loss": loss}
+        checkpoint.save(self.checkpoint, tensors, state, self._facts())
         self._last_save = time.monotonic()
 
     def _restore(self, optimisers) -> None:
@@ -193,7 +199,7 @@ class NTBCTrainer:
         for name, optimiser in optimisers.items():
             for part in ("first", "second"):
                 getattr(optimiser, part).copy_(self._pending[f"optimiser.{name}.{part}"])
-            optimiser.refresh(self._position() >= 1.0 - self.config.quantised)
+            optimiser.refresh(self._rounded)
         self._pending = None
 
     def resume(self) -> bool:
@@ -207,7 +213,7 @@ class NTBCTrainer:
         tensors, state = checkpoint.load(self.checkpoint, self._facts())
         self.model.load_state_dict({k.removeprefix("model."): v for k, v in tensors.items() if k.startswith("model.")})
         self._number, self._step, self._count = state["number"], state["step"], state["count"]
-        self._elapsed = state["elapsed"]
+        self._elapsed, self._rounded = state["elapsed"], state["rounded"]
         self.last_loss = math.nan if state["loss"] is None else state["loss"]
         self._pending = {name: value for name, value in tensors.items() if name.startswith("optimiser.")}
         return True
