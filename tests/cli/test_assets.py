@@ -101,7 +101,7 @@ def test_eval_without_encoders_says_so_and_goes_on(run, matched, monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "code", "message"),
     [
-        (("--baselines", "bc_ful"), 2, "--baselines must be one of bc_full, bc_half"),
+        (("--baselines", "bc_ful"), 2, "--baselines must be one of bc_same, bc_full, bc_half"),
         (("--baselines", "bc_full", "--no-baselines"), 2, "give one of them"),
         (("--picture", "x.jpg"), 2, "--picture must end in .png"),
         (("--against", "none"), 1, "none: no such folder or manifest"),

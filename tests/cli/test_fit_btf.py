@@ -145,7 +145,7 @@ def test_help_names_the_patterns_and_files(run):
     code, stdout, _ = run("fit", "--help")
     assert code == 0
     text = " ".join(stdout.split())
-    for name in (*PATTERNS, "UBO2014 .btf", "UBO2003 .zip", "microgeometry:", "bcf, neubrdf or btf"):
+    for name in (*PATTERNS, "UBO2014 .btf", "UBO2003 .zip", "microgeometry:", "bcf, ntbc, neubrdf or btf"):
         assert name in text, name
 
 
