@@ -27,10 +27,8 @@ def asset(tmp_path):
 def fitted(monkeypatch):
     """Arguments of the fit that the command line asks for, which is not done."""
     pytest.importorskip("torch")
-    from warp_neumat import models
     from warp_neumat.training import fit
 
-    monkeypatch.setitem(models.REGISTRY, "ntbc", models.REGISTRY.get("ntbc", "warp_neumat.models.bcf"))
     found = {}
     monkeypatch.setattr(fit, "fit", lambda source, out, **options: found.update(options) or {"metrics": {"psnr": 1.0}})
     return found
