@@ -38,8 +38,8 @@ METHODS = {
     "naive conservative": {"mode": "conservative", "variant": "naive"},
     "ntbc aggressive": {"mode": "aggressive"},
     "ntbc conservative": {"mode": "conservative"},
-    "as the paper, aggressive": {"mode": "aggressive", **PAPER},
-    "as the paper, conservative": {"mode": "conservative", **PAPER},
+    "paper aggressive": {"mode": "aggressive", **PAPER},
+    "paper conservative": {"mode": "conservative", **PAPER},
 }
 """Method → options of the fit."""
 

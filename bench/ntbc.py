@@ -131,7 +131,7 @@ def figure4(lab: Lab):
     families = {
         "naive": [m for m in points if m.startswith("naive")],
         "ntbc": [m for m in points if m.startswith("ntbc") and not m.endswith("grids")],
-        "as the paper": [m for m in points if m.startswith("as the paper")],
+        "as the paper": [m for m in points if m.startswith("paper")],
         "bc ours": ["bc ours"],
     }
     from matplotlib.figure import Figure
