@@ -10,6 +10,8 @@ torch = pytest.importorskip("torch")
 from tests.tiny_maps import tiny_maps  # noqa: E402
 from warp_neumat.io.asset import unpack_bits  # noqa: E402
 from warp_neumat.io.texture_set import open_texture_set  # noqa: E402
+from warp_neumat.kernels.ntbc_network import NetworkShape  # noqa: E402
+from warp_neumat.kernels.ntbc_train import StepShape  # noqa: E402
 from warp_neumat.models import ntbc_config  # noqa: E402
 from warp_neumat.models.ntbc import (  # noqa: E402
     block_colours,
@@ -24,6 +26,7 @@ from warp_neumat.models.ntbc import (  # noqa: E402
     rounded_grid,
 )
 from warp_neumat.models.ntbc_config import Plane, levels  # noqa: E402
+from warp_neumat.models.ntbc_plain import losses, network, places  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -241,3 +244,17 @@ def test_the_same_seed_draws_the_same_and_padding_stays_zero(source):
     held = sum(w.numel() for w, _ in layers(first.shape.texel, first.texel_net))
     assert int((first.texel_net != 0).sum()) <= held
     assert float(first.texel_grid.abs().max()) <= 1e-4
+
+
+def test_plain_torch_keeps_to_one_device():
+    """The meta device refuses to be mixed with the CPU, as a GPU would."""
+    ends, texels = (NetworkShape(((4, 4), (8, 8)), outputs) for outputs in (8, 4))
+    shape = StepShape(ends, texels, ((4, 3), (8, 1)))
+
+    def empty(*size):
+        return torch.zeros(*size, device="meta")
+
+    blocks = torch.zeros(8, dtype=torch.long, device="meta")
+    said = network(ends, empty(ends.grid_words), empty(ends.weights), places(8, 8, blocks, False))
+    x = network(texels, empty(texels.grid_words), empty(texels.weights), places(8, 8, blocks, True))
+    assert losses(shape, said, x, empty(8, 8), empty(8, 4, 16), empty(2, 4, 4)).shape == (5,)

@@ -15,7 +15,7 @@ def network(shape: NetworkShape, grids, net, places):
     found = []
     for (width, height), at, words in zip(shape.levels, shape.grid_offsets, shape.grid_sizes, strict=True):
         grid = grids[at : at + words].view(height, width, shape.features)
-        p = places * torch.tensor([width, height], dtype=places.dtype) - 0.5
+        p = places * torch.tensor([width, height], dtype=places.dtype, device=places.device) - 0.5
         low = p.floor()
         fx, fy = ((p - low)[:, n : n + 1].to(grids.dtype) for n in range(2))
         (i0, j0), size = low.long().T, (width, height)
@@ -34,10 +34,10 @@ def network(shape: NetworkShape, grids, net, places):
 def places(rows: int, columns: int, blocks, texels: bool):
     """Return (u, v) of blocks (n,), or of their texels (16 n,), [., 2] float64."""
     by, bx = blocks.long() // columns, blocks.long() % columns
-    size = torch.tensor([columns, rows], dtype=torch.float64)
+    size = torch.tensor([columns, rows], dtype=torch.float64, device=blocks.device)
     if not texels:
         return (torch.stack([bx, by], 1) + 0.5) / size
-    t = torch.arange(16)
+    t = torch.arange(16, device=blocks.device)
     x, y = 4 * bx[:, None] + t % 4, 4 * by[:, None] + t // 4
     return ((torch.stack([x, y], 2) + 0.5) / (4 * size)).view(-1, 2)
 
@@ -47,7 +47,7 @@ class Expected(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, d, temperature):
-        w = torch.arange(d.shape[-1], dtype=d.dtype) / (d.shape[-1] - 1)
+        w = torch.arange(d.shape[-1], dtype=d.dtype, device=d.device) / (d.shape[-1] - 1)
         ctx.save_for_backward(d, w)
         ctx.temperature = temperature
         return w[d.argmax(-1)]
@@ -68,7 +68,7 @@ def squared(delta, metric):
 
 def index_weight(x, e0, e1, entries, metric, temperature):
     """Return the weight of the palette entry nearest to x (B, 16, K), [B, 16, 1] (NTBC Eq. 9, 10)."""
-    w = torch.arange(entries, dtype=x.dtype) / (entries - 1)
+    w = torch.arange(entries, dtype=x.dtype, device=x.device) / (entries - 1)
     palette = (1 - w[:, None]) * e0[:, None, None] + w[:, None] * e1[:, None, None]
     d = -torch.sqrt(squared(x[:, :, None] - palette, metric) + 1e-12)
     return Expected.apply(d, temperature)[..., None]

@@ -51,13 +51,9 @@ class BlockMapData(MapData):
     @staticmethod
     def trainer(module, source, shape, plan, device, *, checkpoint, **more):
         """Return the trainer of the texture set."""
-        if device.type != "cpu":
-            raise ValueError(
-                f"device must be cpu: the fused training of ntbc has no {device.type} version; leave it out"
-            )
         pixels = source.pixels
         return NTBCTrainer(
-            module.build(shape, plan.seed),
+            module.build(shape, plan.seed).to(device),
             pixels,
             lambda planes: reference_endpoints(planes, pixels),
             plan,

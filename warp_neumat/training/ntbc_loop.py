@@ -28,6 +28,7 @@ from warp_neumat.models.ntbc import NTBC, block_colours, metrics
 from warp_neumat.ops.grid_update import GridAdam
 from warp_neumat.ops.ntbc import NTBCStep
 from warp_neumat.training import checkpoint
+from warp_neumat.training.ntbc_torch import TorchAdam, TorchStep
 
 WARMUP = 10
 """Steps in which the learning rates rise (NTBC §3.4)."""
@@ -47,7 +48,7 @@ MOST_PARTS = 8
 
 
 class NTBCTrainer:
-    """Trains a :class:`warp_neumat.models.ntbc.NTBC` on the finest mip of a texture set; CPU only.
+    """Trains a :class:`warp_neumat.models.ntbc.NTBC` on the finest mip of a texture set.
 
     Args:
         model: The model; its buffers are trained in place.
@@ -58,10 +59,21 @@ class NTBCTrainer:
         identity: JSON-able facts that a checkpoint must share with the run that resumes it.
         progress: ``progress(fraction, text)``, called several times a second at most.
         watch: ``watch(model number, step)``, called every 100 steps, for measurements.
+        fused: Whether to train by the fused kernels or in plain torch; default: fused where the model is on the CPU.
     """
 
     def __init__(
-        self, model: NTBC, pixels, reference, plan, *, checkpoint_path=None, identity=None, progress=None, watch=None
+        self,
+        model: NTBC,
+        pixels,
+        reference,
+        plan,
+        *,
+        checkpoint_path=None,
+        identity=None,
+        progress=None,
+        watch=None,
+        fused: bool | None = None,
     ):
         self.model, self.plan, self.config = model, plan, model.config
         self.pixels, self.reference = pixels, reference
@@ -74,7 +86,8 @@ class NTBCTrainer:
         self._rounded = False  # whether the last step left grids rounded
         self._batch = plan.batch
         self._pending: dict | None = None
-        self._parts = min(MOST_PARTS, dispatch.worker_count())
+        self._fused = next(model.buffers()).device.type == "cpu" if fused is None else fused
+        self._parts = min(MOST_PARTS, dispatch.worker_count()) if self._fused else 1
 
     def run(self) -> dict:
         """Train all models that are left; return training facts."""
@@ -107,7 +120,7 @@ class NTBCTrainer:
         if not naive and config.endpoints == "network":
             endpoints = self.reference(planes)
         optimisers = self._optimisers(pair)
-        step = NTBCStep(
+        step = (NTBCStep if self._fused else TorchStep)(
             pair.shape, config.rows, config.columns, colours, endpoints, *(o.used for o in optimisers.values()),
             batch=batch, parts=self._parts, metric=metrics(config, pair.model), temperature=config.temperature,
             gradients=[o.gradients for o in optimisers.values()],
@@ -142,12 +155,14 @@ class NTBCTrainer:
         """Return the optimiser of each buffer: grids lazily, as few of their vertices see a batch."""
         found = {}
         for name, shape, grids, grid, net in pair.networks():
+            where = {"offsets": shape.grid_offsets} if self._fused else {"shape": shape}
             for kind, value, more in (
-                ("grid", grid, {"offsets": shape.grid_offsets, "bits": grids.bits}),
-                ("net", net, {"bits": None, "lazy": False}),
+                ("grid", grid, {**where, "bits": grids.bits}),
+                ("net", net, {"bits": None, "lazy": False} | ({} if self._fused else {"shape": None})),
             ):
-                gradients = torch.zeros(self._parts, value.numel())
-                found[f"{name}_{kind}"] = GridAdam(value, gradients, betas=BETAS, eps=1e-15, **more)
+                gradients = torch.zeros(self._parts, value.numel(), device=value.device)
+                adam = GridAdam if self._fused else TorchAdam
+                found[f"{name}_{kind}"] = adam(value, gradients, betas=BETAS, eps=1e-15, **more)
         return found
 
     def _note(self, step: NTBCStep, naive: bool) -> None:
