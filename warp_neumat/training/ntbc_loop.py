@@ -112,13 +112,14 @@ class NTBCTrainer:
     def _train(self, pair) -> None:
         config, naive = self.config, self.config.variant == "naive"
         planes = config.planes(pair.model)
-        self._report("looking at the reference")
+        self._report("encoding the reference")
         colours = block_colours(planes, self.pixels)
         count = len(colours)
         batch = self._batch = min(self.plan.batch, 8 * (count // 8) or 8)
         endpoints = torch.zeros(count, 2 * colours.shape[1])
         if not naive and config.endpoints == "network":
             endpoints = self.reference(planes)
+        self._report("preparing the kernels")  # seconds where they are compiled for the first time
         optimisers = self._optimisers(pair)
         step = (NTBCStep if self._fused else TorchStep)(
             pair.shape, config.rows, config.columns, colours, endpoints, *(o.used for o in optimisers.values()),
