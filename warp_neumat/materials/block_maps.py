@@ -5,9 +5,7 @@ encoded domain of its channel (a ``_srgb`` format is not linearised before it is
 what comes after). Channels lie by threes in the storage ``rgba8`` of :mod:`warp_neumat.kernels.bcf_storage`, four bytes
 a texel, in the order of the channels, so that the features that :mod:`warp_neumat.kernels.bcf` samples are the
 channels, and there is no network behind them. Beside the storage ``half``, which could hold them too, this takes half
-the memory, is exact, and needs no neighbour beside a texel, for a tenth to a quarter of the speed (9 channels on two
-busy cores of Zen 3, million samples a second at 2048²: 12.3 against 15.6 at random places of level 0, 7.9 against 8.3
-of level 0.5, 25 against 30 of level 0.5 along rows).
+the memory, is exact, and needs no neighbour beside a texel, for a tenth to a quarter of the speed.
 """
 
 from collections.abc import Sequence
