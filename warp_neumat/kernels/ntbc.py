@@ -17,7 +17,16 @@ import warp as wp
 
 from warp_neumat.kernels import arrays, dispatch
 from warp_neumat.kernels.block_pack import pack_code
-from warp_neumat.kernels.ntbc_network import HEAD, SELU_ALPHA, SELU_SCALE, TAP, Layout, NetworkCode, NetworkShape
+from warp_neumat.kernels.ntbc_network import (
+    HEAD,
+    SELU_ALPHA,
+    SELU_SCALE,
+    TAP,
+    Layout,
+    NetworkCode,
+    NetworkShape,
+    check_outputs,
+)
 
 PATCH = 16
 """Blocks that one CPU thread owns."""
@@ -42,12 +51,7 @@ class ModelShape:
         for name, channels in self.planes:
             if name not in FORMATS or channels not in FORMATS[name][2]:
                 raise ValueError(f"planes must be ('bc1', 3), ('bc4', 1) or ('bc7', 3 or 4), got {(name, channels)}")
-        expected = (2 * self.channels, len(self.planes) if self.naive else self.channels)
-        if not self.planes or (self.endpoint.outputs, self.texel.outputs) != expected:
-            raise ValueError(
-                f"endpoint and texel network must have {expected[0]} and {expected[1]} outputs for planes {self.planes}"
-                f", got {self.endpoint.outputs} and {self.texel.outputs}"
-            )
+        check_outputs(self.endpoint, self.texel, len(self.planes), self.channels, self.naive, self.planes)
 
     @property
     def channels(self) -> int:

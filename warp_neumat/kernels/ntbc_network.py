@@ -152,6 +152,17 @@ auto tap = [](double place, int size, int& low, int& high, float& share) {
 """
 """tap(place, size, low, high, share), what every look-up in a grid needs."""
 
+
+def check_outputs(endpoint: NetworkShape, texel: NetworkShape, planes: int, channels: int, naive: bool, names) -> None:
+    """Raise a ValueError unless both networks have the outputs that a model's planes need (NTBC §4.1)."""
+    expected = (2 * channels, planes if naive else channels)
+    if not planes or (endpoint.outputs, texel.outputs) != expected:
+        raise ValueError(
+            f"endpoint and texel network must have {expected[0]} and {expected[1]} outputs for planes {names}"
+            f", got {endpoint.outputs} and {texel.outputs}"
+        )
+
+
 HEAD = (
     VECTORS
     + EXPONENTIAL

@@ -31,7 +31,13 @@ import functools
 import warp as wp
 
 from warp_neumat.kernels import dispatch
-from warp_neumat.kernels.ntbc_network import HEAD, Layout, NetworkCode, NetworkShape
+from warp_neumat.kernels.ntbc_network import (
+    HEAD,
+    Layout,
+    NetworkCode,
+    NetworkShape,
+    check_outputs,
+)
 
 PATCH = 8
 """Blocks that go through the networks at once: 128 rows of the texel network."""
@@ -55,12 +61,7 @@ class StepShape:
     def __post_init__(self):
         if not self.planes or any(entries < 2 or not 1 <= channels <= 4 for entries, channels in self.planes):
             raise ValueError(f"planes must be (entries, channels) of at least 2 and 1 to 4, got {self.planes}")
-        expected = (2 * self.channels, len(self.planes) if self.naive else self.channels)
-        if (self.endpoint.outputs, self.texel.outputs) != expected:
-            raise ValueError(
-                f"endpoint and texel network must have {expected[0]} and {expected[1]} outputs for planes {self.planes}"
-                f", got {self.endpoint.outputs} and {self.texel.outputs}"
-            )
+        check_outputs(self.endpoint, self.texel, len(self.planes), self.channels, self.naive, self.planes)
 
     @property
     def channels(self) -> int:

@@ -128,19 +128,18 @@ class NTBCTrainer:
         )  # fmt: skip
         self._restore(optimisers)
         draws = _Blocks(self.plan.seed, self._number, count, batch)
+        fitted = config.endpoints == "fitted"
+        apart, together = (torch.tensor(COLOURS if fitted else factors) for factors in (APART, JOINT))
         while (position := self._position()) < 1.0:
             self._save_if_due(optimisers)
             joint, rounded = position >= 1.0 - config.joint, position >= 1.0 - config.quantised
-            if config.endpoints == "fitted":
-                step.weights.copy_(torch.tensor(COLOURS))
-            else:
-                step.weights.copy_(torch.tensor(JOINT if joint or naive else APART))
+            step.weights.copy_(together if joint or naive else apart)
             frozen = naive and position >= NAIVE_SWITCH
             step.run(draws(self._step), quantised=frozen)
             self._step, self._count = self._step + 1, self._count + 1
             scale = min(1.0, self._step / WARMUP) * 0.5 * (1.0 + math.cos(math.pi * position))
             for name, optimiser in optimisers.items():
-                if name.startswith("endpoint") and config.endpoints == "fitted":
+                if name.startswith("endpoint") and fitted:
                     continue
                 still = frozen and name.startswith("texel")
                 rate = 0.0 if still else config.rates[0 if name.endswith("grid") else 1] * scale
