@@ -162,6 +162,21 @@ def test_plain_torch_trains_the_same(maps, variant):
     assert runs[0].last_loss == pytest.approx(runs[1].last_loss, rel=0.05)
 
 
+def test_the_naive_weights_rest_at_the_end(maps, monkeypatch):
+    """For the last fifth the endpoint network alone is tuned to rounded weights (NTBC §3.1)."""
+    trainer = make(maps, steps=50, mode="conservative", variant="naive")
+    pair, kept = trainer.model.pairs[0], {}
+
+    def keep(optimisers):
+        if (trainer._number, trainer._step) == (0, 40):
+            kept.update({name: value.clone() for name, value in pair.named_buffers()})
+
+    monkeypatch.setattr(trainer, "_save_if_due", keep)
+    trainer.run()
+    for name, value in pair.named_buffers():
+        assert torch.equal(value, kept[name]) == name.startswith("texel"), name
+
+
 @pytest.mark.parametrize("bits", [4, 5, 7])
 def test_what_the_last_step_read_is_what_is_stored(maps, bits, monkeypatch):
     config = configure(maps, {"mode": "aggressive", "rate": "paper", "endpoints": "network"})
